@@ -5,6 +5,7 @@ A class has the built-in error that says the same as another base, such as ``Val
 
 from __future__ import annotations
 
+import difflib
 import reprlib
 from collections.abc import Iterable, Mapping
 
@@ -14,8 +15,12 @@ QUOTED = 200
 """Most characters of a file's content that a message repeats."""
 SHORT = 60
 """Most characters of one value, where a message may show several."""
-LISTED = 800
+LISTED = 600
 """Most characters of the names that a message lists."""
+LONGEST = 800
+"""Most characters of our own message about a file."""
+NEAREST = 10
+"""Names that a message gives where all of them would be too long."""
 
 
 def short(value: object, most: int = QUOTED) -> str:
@@ -57,7 +62,7 @@ class ConfigurationError(DealHwError, ValueError):
 
 
 class UnknownNameError(ConfigurationError):
-    """A name that is not in a table.
+    """A name that is not in a table: the message lists the names, or the nearest ones where there are many.
 
     Args:
         what: The kind of name, such as ``"parameter"``.
@@ -68,8 +73,11 @@ class UnknownNameError(ConfigurationError):
     def __init__(self, what: str, given: str, allowed: Iterable[str]) -> None:
         self.given = given
         self.allowed = tuple(allowed)
-        known = short(", ".join(self.allowed) or "(none)", LISTED)
-        super().__init__(f"unknown {what} {short(given)!r}; known: {known}")
+        known = f"known: {', '.join(self.allowed) or '(none)'}"
+        if len(known) > LISTED:
+            near = difflib.get_close_matches(given[:QUOTED], self.allowed, n=NEAREST, cutoff=0.0)
+            known = f"the nearest of {len(self.allowed)}: {short(', '.join(near), LISTED)}"
+        super().__init__(f"unknown {what} {short(given)!r}; {known}")
 
 
 class MissingExtraError(DealHwError, ImportError):
@@ -162,3 +170,11 @@ class CalibrationError(DealHwError):
 
 class InsufficientDataError(CalibrationError):
     """The recording is too short or without excitation."""
+
+
+class ClusterError(DealHwError):
+    """The workers of a cluster cannot be used."""
+
+
+class TaskLostError(ClusterError):
+    """The worker of a task ended before the task, each time that it was begun."""

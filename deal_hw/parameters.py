@@ -320,6 +320,17 @@ class ParameterDistribution:
             latency_s=(latency_s, latency_s),
         )
 
+    def without(self, names: Iterable[str]) -> ParameterDistribution:
+        """Return the distribution of the other parameters, whatever the values of these."""
+        left = set(names)
+        kept = [k for k, name in enumerate(self.space.names) if name not in left]
+        return dataclasses.replace(
+            self,
+            space=ParameterSpace(p for p in self.space.parameters if p.name not in left),
+            mean=self.mean[kept],
+            covariance=None if self.covariance is None else self.covariance[np.ix_(kept, kept)],
+        )
+
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Draw physical values, (count, K), inside the range."""
         if self.covariance is None:
@@ -398,6 +409,9 @@ class _DistributionFile:
 
 
 def _covariance(values: Any, size: int) -> FloatArray:
+    if not size and values == []:
+        # Nothing is uncertain but the latency: an empty matrix is written as an empty list.
+        return np.zeros((0, 0))
     found = numbers(values, "covariance", (size, size))
     if np.abs(found).max(initial=0.0) > _LARGEST_VARIANCE:
         raise ConfigurationError(f"covariance contains a value above {_LARGEST_VARIANCE:g}")

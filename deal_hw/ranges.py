@@ -11,13 +11,16 @@ checks that every number of every verb has a range.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, short, shown
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +75,17 @@ def option(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def once_a_class(read: Callable[[Any], R]) -> Callable[[Any], R]:
+    """Keep what a function reads from a class; `functools.cache` alone forgets the type of the argument."""
+    return functools.cache(read)
+
+
+@once_a_class
+def hints_of(settings: Any) -> dict[str, Any]:
+    """Return the types of a class's fields; to make them of the text of annotations takes milliseconds."""
+    return get_type_hints(settings, include_extras=True)
+
+
 def check_ranges(settings: Any) -> None:
     """Check the numbers and choices of a settings dataclass against their types.
 
@@ -80,7 +94,7 @@ def check_ranges(settings: Any) -> None:
             and range.
         UnknownNameError: A name is none of the choices.
     """
-    for name, hint in get_type_hints(type(settings), include_extras=True).items():
+    for name, hint in hints_of(type(settings)).items():
         value = getattr(settings, name)
         kinds = set(_kinds(hint))
         if get_origin(hint) is Annotated:

@@ -21,7 +21,7 @@ import numpy as np
 
 from deal_hw import schema
 from deal_hw.errors import (
-    LISTED,
+    LONGEST,
     ConfigurationError,
     DatasetError,
     DealHwError,
@@ -76,7 +76,7 @@ def reading(
     except DealHwError as err:
         text = str(err) if str(path) in str(err) else f"{path}: {err}"
         # Our own message may list the names in a file.
-        text = short(text, LISTED + len(str(path)))
+        text = short(text, LONGEST + len(str(path)))
         err.args = (text if advice in text else text + then,)
         raise
     except FileNotFoundError as err:

@@ -32,6 +32,13 @@ def in_real_time(item: pytest.Item) -> bool:
     return item.get_closest_marker("real_time") is not None
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """For `-m slow` read only the files that name the marker; each worker collects for itself."""
+    if config.option.markexpr != "slow" or not collection_path.match("test_*.py"):
+        return None
+    return "mark.slow" not in collection_path.read_text(encoding="utf-8") or None
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
     """Tell a worker of pytest-xdist where to list its tests in real time: the controller sees no markers."""

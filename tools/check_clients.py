@@ -60,8 +60,6 @@ from deal_hw.workflows.own_robot.new import new_robot
 TOOLS = Path(__file__).resolve().parent / "clients"
 _TRIES = 3
 _BITRATE = 500_000
-_HESITATION_S = 0.5
-"""Time before a key is pressed: a program sets the terminal up after its prompt, and forgets earlier keys."""
 _HEAD, _TAIL = 14, 8
 """Lines of a program's output that the transcript keeps."""
 _CONFIG = {
@@ -141,7 +139,7 @@ def run_in_terminal(
             elif process.poll() is not None:
                 break
             if keys and due_s is None and (at := output.find(keys[0][0], seen)) >= 0:
-                seen, due_s = at + len(keys[0][0]), passed_s + _HESITATION_S
+                seen, due_s = at + len(keys[0][0]), passed_s + client.hesitation_s
             if due_s is not None and passed_s >= due_s:
                 os.write(master, keys.pop(0)[1].encode())
                 due_s = None

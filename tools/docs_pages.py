@@ -27,6 +27,7 @@ if str(Path(__file__).parent) not in sys.path:  # mkdocs loads a hook by its pat
     sys.path.append(str(Path(__file__).parent))
 
 from refusals import EXIT_ERROR, Refusal, refusals, words
+from syntax import dotted, walk
 
 from deal_hw.workflows.kinds import Kinds
 
@@ -301,8 +302,9 @@ def alarms() -> list[tuple[str, ...]]:
     found = []
     for folder in ALARM_FOLDERS:
         for path in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding.alarm" and node.args:
+            text = path.read_text(encoding="utf-8")
+            for node in walk(ast.parse(text)) if "Finding.alarm" in text else ():
+                if isinstance(node, ast.Call) and dotted(node.func) == "Finding.alarm" and node.args:
                     parts = [shortened(words(part)) for part in node.args]
                     # An alarm without a text of its own is copied from a file or from the table of causes.
                     if parts[0].strip("…"):
@@ -358,13 +360,17 @@ def examples_page() -> str:
     return "\n".join(lines)
 
 
-def pages() -> dict[str, str]:
-    """Return every page that is made: its place in the site and its Markdown."""
+def pages(refused: list[Refusal]) -> dict[str, str]:
+    """Return every page that is made: its place in the site and its Markdown.
+
+    Args:
+        refused: What the page of errors lists.
+    """
     return {
         "reference/cli.md": cli_page(),
         **api_pages(),
         "reference/alarms.md": alarms_page(),
-        "reference/errors.md": errors_page(refusals(ROOT)),
+        "reference/errors.md": errors_page(refused),
         "how-to/examples.md": examples_page(),
         "contributing.md": moved("CONTRIBUTING.md"),
         "changelog.md": moved("CHANGELOG.md"),
@@ -393,6 +399,6 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages; mkdocs calls this once it has listed docs/."""
     from mkdocs.structure.files import File
 
-    for place, text in pages().items():
+    for place, text in pages(refusals(ROOT)).items():
         files.append(File.generated(config, place, content=text))
     return files

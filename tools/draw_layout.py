@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-from import_graph import Graph, circles, closure, contracted, module_graph, read_sources
+from import_graph import Graph, SourceFile, circles, closure, contracted, module_graph, read_sources
 
 TOP = "deal_hw"
 ENTRY = frozenset({"__init__", "__main__"})
@@ -298,9 +298,8 @@ def _curve(x: float, y: float, to_x: float, to_y: float) -> str:
     return f"C{x:.1f} {y - bend:g} {to_x:.1f} {to_y + bend:g} {to_x:.1f} {to_y:g}"
 
 
-def draw(root: Path) -> str:
-    """Return the picture of a checkout."""
-    sources = read_sources(root)
+def draw(sources: Mapping[str, SourceFile]) -> str:
+    """Return the picture of a checkout's sources by their modules."""
     packages = {file.module for file in sources.values() if file.path.name == "__init__.py"}
     return svg(module_graph(sources, ("load", "call", "types")), packages)
 
@@ -316,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--root", type=Path, default=root, help="checkout to draw; by default this one")
     given = parser.parse_args(arguments)
-    given.out.write_text(draw(given.root), encoding="utf-8")
+    given.out.write_text(draw(read_sources(given.root)), encoding="utf-8")
     return 0
 
 

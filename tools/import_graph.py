@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import tomllib
+from syntax import children, dotted
 
 When = Literal["load", "call", "types", "text"]
 """Kind of an import: at the module's load, when a function runs, never (under ``TYPE_CHECKING``, for type
@@ -47,35 +48,45 @@ def imports(tree: ast.AST) -> Iterator[Import]:
     Text counts if it is a dotted name, such as ``"deal_hw.calib.deal:Deal"``. The caller checks whether the
     module exists.
     """
-    yield from _imports(tree, "load")
+    waiting: list[tuple[ast.AST, When]] = [(tree, "load")]
+    while waiting:
+        node, when = waiting.pop()
+        yield from _imports(node, when)
+        waiting += reversed(_inside(node, when))
 
 
 def _imports(node: ast.AST, when: When) -> Iterator[Import]:
+    """Yield what a node itself imports."""
     if isinstance(node, ast.Import):
         yield from (Import(node.lineno, alias.name, (), when) for alias in node.names)
     elif isinstance(node, ast.ImportFrom):
         source = "." * node.level + (node.module or "")
         yield Import(node.lineno, source, tuple(alias.name for alias in node.names), when)
-    elif isinstance(node, ast.Call) and ast.unparse(node.func) in IMPORT_CALLS:
-        first = node.args[0] if node.args else None
-        if isinstance(first, ast.Constant) and isinstance(first.value, str):
-            yield Import(node.lineno, first.value, (), when, by_call=True)
-            # Not counted again as text.
-            for child in (*node.args[1:], *node.keywords):
-                yield from _imports(child, when)
-            return
+    elif isinstance(node, ast.Call) and (called := _named_by_call(node)):
+        yield Import(node.lineno, called, (), when, by_call=True)
     elif isinstance(node, ast.Constant) and isinstance(node.value, str):
         if MODULE_TEXT.fullmatch(node.value):
             yield Import(node.lineno, node.value.partition(":")[0], (), "text")
-    elif isinstance(node, ast.If) and ast.unparse(node.test) in {"TYPE_CHECKING", "typing.TYPE_CHECKING"}:
-        for child in node.body:
-            yield from _imports(child, "types")
-        for child in node.orelse:
-            yield from _imports(child, when)
-        return
-    inside = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and when == "load"
-    for child in ast.iter_child_nodes(node):
-        yield from _imports(child, "call" if inside else when)
+
+
+def _inside(node: ast.AST, when: When) -> list[tuple[ast.AST, When]]:
+    """Return the nodes below a node that may import, each with its kind."""
+    if isinstance(node, ast.If) and dotted(node.test) in {"TYPE_CHECKING", "typing.TYPE_CHECKING"}:
+        return [*((child, "types") for child in node.body), *((child, when) for child in node.orelse)]
+    if isinstance(node, ast.Call) and _named_by_call(node):
+        # The name is not counted again as text.
+        return [(child, when) for child in (*node.args[1:], *node.keywords)]
+    if when == "load" and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        when = "call"
+    return [(child, when) for child in children(node)]
+
+
+def _named_by_call(node: ast.Call) -> str:
+    """Return the module that `importlib.import_module` or its like gets as text, or ""."""
+    if not (node.args and dotted(node.func) in IMPORT_CALLS):
+        return ""
+    first = node.args[0]
+    return first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else ""
 
 
 @dataclass(frozen=True, slots=True)

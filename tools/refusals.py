@@ -20,9 +20,11 @@ import ast
 import builtins
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+from syntax import children, walk
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("deal_hw", "drivers", "policies", "calib")
@@ -61,9 +63,13 @@ class Refusal:
 
 def error_classes(root: Path = ROOT) -> frozenset[str]:
     """Return the names of the classes of the error tree, those outside of errors.py among them."""
+    return _error_classes(_parsed(path) for path in _sources(root))
+
+
+def _error_classes(trees: Iterable[ast.Module]) -> frozenset[str]:
     bases: dict[str, set[str]] = {}
-    for path in _sources(root):
-        for node in ast.walk(_parsed(path)):
+    for tree in trees:
+        for node in walk(tree):
             if isinstance(node, ast.ClassDef):
                 bases.setdefault(node.name, set()).update(map(_last_name, node.bases))
     known = {"DealHwError"}
@@ -74,14 +80,13 @@ def error_classes(root: Path = ROOT) -> frozenset[str]:
 
 def refusals(root: Path = ROOT) -> list[Refusal]:
     """Return all refusals of a checkout, in the table's order."""
-    known = error_classes(root)
-    return sorted(found for path in _sources(root) for found in of_file(path, root, known))
+    trees = {path.relative_to(root): _parsed(path) for path in _sources(root)}
+    known = _error_classes(trees.values())
+    return sorted(found for path, tree in trees.items() for found in of_file(path, tree, known))
 
 
-def of_file(path: Path, root: Path, known: frozenset[str]) -> Iterator[Refusal]:
-    """Yield the refusals of one source."""
-    relative = path.relative_to(root)
-    tree = _parsed(path)
+def of_file(relative: Path, tree: ast.Module, known: frozenset[str]) -> Iterator[Refusal]:
+    """Yield the refusals of one source, given its path from the root."""
     for call, function in calls(tree, known, relative == ERRORS):
         kind = _last_name(call.func)
         yield Refusal(
@@ -104,8 +109,9 @@ def calls(tree: ast.Module, known: frozenset[str], defines: bool) -> Iterator[tu
         known: Names of error classes.
         defines: It is errors.py, where a class passes its words to its base class.
     """
-
-    def walk(node: ast.AST, function: str, raised: bool) -> Iterator[tuple[ast.Call, str]]:
+    waiting: list[tuple[ast.AST, str, bool]] = [(tree, "", False)]
+    while waiting:
+        node, function, raised = waiting.pop()
         if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             function = f"{function}.{node.name}".lstrip(".")
         if isinstance(node, ast.Call):
@@ -119,10 +125,7 @@ def calls(tree: ast.Module, known: frozenset[str], defines: bool) -> Iterator[tu
             chosen = [node.body, node.orelse]
         elif raised and isinstance(node, ast.BoolOp):
             chosen = [*node.values]
-        for child in ast.iter_child_nodes(node):
-            yield from walk(child, function, child in chosen)
-
-    yield from walk(tree, "", False)
+        waiting += [(child, function, child in chosen) for child in reversed(children(node))]
 
 
 def table(found: list[Refusal]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,6 +135,11 @@ class Sensitivity:
     def faint(self) -> tuple[str, ...]:
         """Parameters whose whole range changes no sample by more than the noise."""
         return tuple(n for n, e in zip(self.names, self.effect, strict=True) if NOTHING <= e < FAINT)
+
+    def without(self, names: Collection[str]) -> Sensitivity:
+        """Return that of the other parameters."""
+        kept = [k for k, name in enumerate(self.names) if name not in names]
+        return Sensitivity(tuple(self.names[k] for k in kept), self.effect[kept])
 
 
 def compute_sensitivity(problem: Problem) -> Sensitivity:

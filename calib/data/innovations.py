@@ -77,9 +77,14 @@ def predict(
     data: WindowData,
     position: FloatArray | None = None,
     velocity: FloatArray | None = None,
+    *,
+    population: bool = False,
 ) -> MemberPrediction:
-    """Predict windows like :meth:`Problem.predict`, also for slightly negative latencies."""
-    batch = problem.batch(len(members.theta))
+    """Predict windows like :meth:`Problem.predict`, also for slightly negative latencies.
+
+    A search's ``population`` is simulated by the problem's engine, which may be less exact.
+    """
+    batch = problem.batch(len(members.theta), data.episode, population=population)
     batch.set_parameters(members.theta)
     path = early_setpoints(batch, problem.episodes[data.episode], members.latency_s)
     return problem.predict_along(batch, path, data, position, velocity)
@@ -185,24 +190,29 @@ def whitened_residual(
     windows: list[WindowData],
     offsets: list[FloatArray] | None = None,
     whitenings: Sequence[Whitening] | None = None,
+    *,
+    population: bool = False,
 ) -> FloatArray:
     """Return recording minus prediction of every window, whitened around one simulator, ``centre``.
 
     It is (N, M), not finite in rows of diverged members. ``offsets`` are the start states at the
     linearisation point, one array per entry of ``windows``, updated in place; None for the smoothed states.
-    ``whitenings`` were computed before for the same simulator and start states.
+    ``whitenings`` were computed before for the same simulator and start states. ``population`` as in
+    :func:`predict`.
     """
     parts = []
     for i, data in enumerate(windows):
         if problem.noise_free:
-            whitened = (data.measured - predict(problem, members, data).observed) / data.std
+            predicted = predict(problem, members, data, population=population).observed
+            whitened = (data.measured - predicted) / data.std
             parts.append(whitened.reshape(len(whitened), -1))
             continue
         if whitenings is not None:
             whitening = whitenings[i]
         else:
             whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
-        predicted = predict(problem, members, data, *whitening.starts(data)).observed
+        starts = whitening.starts(data)
+        predicted = predict(problem, members, data, *starts, population=population).observed
         whitened = whitening.innovation(data.measured, predicted)
         parts.append(whitened.reshape(len(whitened), -1))
         if offsets is not None:

@@ -68,6 +68,9 @@ SMOOTHING_ORDER = 3
 FEWEST_SMOOTHED = 7
 """Fewest samples of a polynomial."""
 
+WHOLE_STEPS = 0.05
+"""Largest distance from a whole number of steps of values that are counts [steps]."""
+
 REST = 24
 """Steps of one value above which a joint is at rest [-]. In fewer, a slow motion passes a count of its
 encoder: that is rounding, which counts as noise."""
@@ -117,12 +120,35 @@ def _rounding_std(parts: Sequence[FloatArray], reported: Sequence[Mask | None]) 
     """Return the noise of rounding to an encoder's counts, (J,): the least step between values over sqrt(12).
 
     The values of all parts count together: few samples of a fast motion lie many counts apart. Values that
-    differ by less than the wire's resolution are one value, such as 0.1 and 0.1 + 2 pi - 2 pi.
+    differ by less than the wire's resolution are one value, such as 0.1 and 0.1 + 2 pi - 2 pi. An uneven
+    clock is resampled, which makes values between counts; those that stay for two samples are counts.
     """
-    values = np.concatenate([x if m is None else x[m] for x, m in zip(parts, reported, strict=True)])
-    steps = [np.diff(np.unique(column)) for column in values.T]
-    least = RESOLUTION / 2
-    return np.array([min(s[s > least], default=0.0) for s in steps]) / math.sqrt(12.0)
+    taken = [x if m is None else x[m] for x, m in zip(parts, reported, strict=True)]
+    return np.array([_count([x[:, j] for x in taken]) for j in range(taken[0].shape[1])]) / math.sqrt(12.0)
+
+
+def _count(parts: Sequence[FloatArray]) -> float:
+    """Return the step between the counts of a channel; 0 where it has one value."""
+    every, held = _Counts.of(parts), _Counts.of([x[1:][x[1:] == x[:-1]] for x in parts])
+    return held.step if held.regular and not every.regular else every.step
+
+
+@dataclass(frozen=True, slots=True)
+class _Counts:
+    """The least step between values, and whether more than two values all lie whole steps apart."""
+
+    step: float
+    regular: bool
+
+    @classmethod
+    def of(cls, parts: Sequence[FloatArray]) -> _Counts:
+        values = np.unique(np.concatenate(parts))
+        steps = np.diff(values)
+        step = min(steps[steps > RESOLUTION / 2], default=0.0)
+        if len(values) < 3 or step <= 0:
+            return cls(float(step), regular=False)
+        apart = (values - values[0]) / step
+        return cls(float(step), regular=bool(np.all(np.abs(apart - np.round(apart)) < WHOLE_STEPS)))
 
 
 def _differences(
@@ -211,7 +237,8 @@ def noise_model(
         return NoiseModel(whole, 0.0)
     rest = whole.copy()
     for j, x, y, s in lines:
-        rest[j] = math.sqrt(max(float(np.average(y - variance * x, weights=1 / s**2)), floor**2))
+        at_rest = float(np.average(y - variance * x, weights=1 / s**2))
+        rest[j] = math.sqrt(max(at_rest, floor**2, rounding[j] ** 2))
     return NoiseModel(rest, math.sqrt(variance))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -30,10 +30,14 @@ from deal_hw.calibration import LATENCY_RANGE_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
+from deal_hw.sim.engine.effort import effort_joints
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
+from deal_hw.sim.parameters.effort import EFFORT_NOISE
 from deal_hw.sim.recordings.episode import SampledEpisode, fill_gaps
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
+from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray, IntArray
 
 Member = tuple[FloatArray, float]
@@ -189,10 +193,15 @@ class Problem:
         start_std: Rollouts of the policy begin in states drawn from the whole recordings, moved by this
             standard deviation of (position, velocity), (2 C,); NaN: the recording's own uncertainty. None:
             they begin in the recorded first state.
+        tasks: Does fits that do not depend on each other; see :mod:`deal_hw.calib.data.independent`.
+        engine: What simulates the populations of searches; all else is simulated by MuJoCo, in float64.
         command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
             to single commands of these recordings: a problem of others begins without.
-        channels: Indices of the measured channels into (position, velocity), (M,).
-        noise_std: Noise of (position, velocity) over all speeds, (2 C,); valid for measured entries only.
+        efforts: Columns of the joints whose recorded effort is compared, (E,); see
+            :mod:`deal_hw.sim.parameters.effort`.
+        channels: Indices of the measured channels into (position, velocity, effort), (M,).
+        noise_std: Noise of (position, velocity, effort) over all speeds, (2 C + E,); valid for measured
+            entries only.
         noise: Noise at rest, and jitter of the sample times.
         starts: Smoothed states of each episode.
     """
@@ -207,11 +216,14 @@ class Problem:
     smoothing_s: float = SMOOTHING_S
     policy: PopulationPolicy | None = None
     start_std: FloatArray | None = None
+    tasks: TaskMap = field(default_factory=InThisProcess)
     command_delays: CommandDelays | None = field(init=False, default=None)
+    efforts: tuple[int, ...] = field(init=False)
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
+    engine: EngineName = "mujoco"
     _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -227,29 +239,54 @@ class Problem:
         if not self.episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
         self.episodes = [fill_gaps(e) for e in self.episodes]
-        self.channels = self.episodes[0].channels
-        if any(not np.array_equal(e.channels, self.channels) for e in self.episodes):
+        states = self.episodes[0].channels
+        if any(not np.array_equal(e.channels, states) for e in self.episodes):
             raise ConfigurationError("the recordings measure different channels; calibrate them one by one")
+        self.efforts = effort_joints(self.robot.description, self.space)
+        first = 2 * self.coordinates
+        self.channels = np.append(states, np.arange(first, first + len(self.efforts), dtype=states.dtype))
         self.noise_std = self._white_noise()
         rotation = self.robot.rotation
         self.starts = [smooth_states(e, self.noise_std, rotation, self.smoothing_s) for e in self.episodes]
         self.noise = self._noise_model()
 
     def _white_noise(self) -> FloatArray:
-        if self.known_std is not None:
-            if self.known_std.shape != (2 * self.coordinates,):
-                raise ConfigurationError(
-                    f"known_std has shape {self.known_std.shape}, expected ({2 * self.coordinates},): "
-                    "positions, then velocities"
-                )
+        size, states = 2 * self.coordinates, self.episodes[0].channels
+        if self.known_std is not None and self.known_std.shape == (size + len(self.efforts),):
             return np.maximum(self.known_std, FLOOR_STD)
+        effort = self._effort_noise()
+        if self.known_std is not None:
+            if self.known_std.shape != (size,):
+                raise ConfigurationError(
+                    f"known_std has shape {self.known_std.shape}, expected ({size},): positions, then "
+                    "velocities"
+                )
+            return np.append(np.maximum(self.known_std, FLOOR_STD), effort)
         if self.noise_free:
-            return np.full(2 * self.coordinates, NOISE_FREE_RESIDUAL)
-        found = np.full(2 * self.coordinates, FLOOR_STD)
-        values = [np.concatenate([e.position, e.velocity], axis=1)[:, self.channels] for e in self.episodes]
+            return np.append(np.full(size, NOISE_FREE_RESIDUAL), effort)
+        found = np.full(size, FLOOR_STD)
+        values = [np.concatenate([e.position, e.velocity], axis=1)[:, states] for e in self.episodes]
         reported = [e.reported for e in self.episodes]
-        found[self.channels] = white_noise_std(values, reported)
-        return self._with_given_noise(found, np.arange(2 * self.coordinates))
+        found[states] = white_noise_std(values, reported)
+        return np.append(self._with_given_noise(found, np.arange(size)), effort)
+
+    def _effort_noise(self) -> FloatArray:
+        """Return the noise of the compared efforts, (E,): the known one, else that of the recordings."""
+        if not self.efforts:
+            return np.empty(0)
+        recorded = [e.effort[:, list(self.efforts)] for e in self.episodes if e.effort is not None]
+        seen = [np.asarray(np.isfinite(values).all(axis=1)) for values in recorded]
+        if not sum(map(np.count_nonzero, seen)):
+            raise InsufficientDataError(
+                "no recording has efforts of the joints whose effort is searched; name their columns as "
+                "`effort` in the column map, or remove effort_gain, effort_bias and effort_delay"
+            )
+        found = white_noise_std([np.nan_to_num(values) for values in recorded], seen)
+        joints = self.robot.description.joint_names
+        for p in self.space.parameters:
+            if p.kind == EFFORT_NOISE:
+                found[[self.efforts.index(joints.index(name)) for name in p.elements]] = p.nominal
+        return np.asarray(found)
 
     def _noise_model(self) -> NoiseModel:
         slow = self.episodes[0].period_s > SLOWEST_JITTER_S
@@ -283,6 +320,16 @@ class Problem:
     def steps(self) -> int:
         """Physics steps simulated so far."""
         return self._batches.steps
+
+    def count(self, steps: int) -> None:
+        """Count physics steps that were simulated in another process."""
+        self._batches.counted.steps += steps
+
+    def on_one_thread(self) -> Problem:
+        """Return the problem for a worker: on one thread, and without the policy, which cannot be sent."""
+        other = copy.copy(self)
+        other.threads, other.policy, other._batches = 1, None, BatchPool(self.robot, self.space, 1)
+        return other
 
     def part(self, chosen: Sequence[Mask]) -> Problem:
         """Return the problem with only the samples under one mask per recording, (T,), usable.
@@ -361,28 +408,48 @@ class Problem:
     def channel_names(self) -> tuple[str, ...]:
         """Names of the measured channels, (M,)."""
         names = self.robot.coordinates
-        every = (*names, *(f"{name}.velocity" for name in names))
+        joints = self.robot.description.joint_names
+        efforts = (f"{joints[j]}.effort" for j in self.efforts)
+        every = (*names, *(f"{name}.velocity" for name in names), *efforts)
         return tuple(every[c] for c in self.channels)
 
     @property
     def channel_units(self) -> tuple[str, ...]:
         """Units of the measured channels, (M,)."""
         units = self.robot.coordinate_units
-        every = (*units, *(f"{unit}/s" for unit in units))
+        joints = self.robot.description.position_units
+        efforts = ("N" if joints[j] == "m" else "N·m" for j in self.efforts)
+        every = (*units, *(f"{unit}/s" for unit in units), *efforts)
         return tuple(every[c] for c in self.channels)
 
-    def batch(self, count: int) -> ServoBatch:
-        """Return the simulator of ``count`` members; the last used sizes are kept."""
-        return self._batches.get(count)
+    def batch(self, count: int, index: int, *, population: bool = False) -> ServoBatch:
+        """Return the simulator of ``count`` members in the set-up of an episode; the last sizes are kept.
 
-    def batches(self, count: int) -> list[ServoBatch]:
-        """Return simulators with ``count`` members in all, one for each thread."""
-        return self._batches.parts(count)
+        The members of a search's ``population`` are simulated by the problem's engine.
+        """
+        return self._batches.get(count, self.episodes[index].setup, self.engine if population else "mujoco")
+
+    def batches(self, count: int, index: int) -> list[ServoBatch]:
+        """Return simulators with ``count`` members in all, one for each thread, as :meth:`batch`."""
+        return self._batches.parts(count, self.episodes[index].setup)
 
     def measured(self, index: int) -> FloatArray:
         """Return the measured channels of an episode, (T, M)."""
+        episode, columns = self.episodes[index], list(self.efforts)
+        # An effort that was not recorded has no weight.
+        effort = np.zeros((len(episode.sample), len(columns)))
+        if columns and episode.effort is not None:
+            effort = np.nan_to_num(episode.effort[:, columns])
+        return np.concatenate([episode.position, episode.velocity, effort], axis=1)[:, self.channels]
+
+    def _reported(self, index: int) -> Mask:
+        """Return which channels of an episode were reported, (T, M)."""
         episode = self.episodes[index]
-        return np.concatenate([episode.position, episode.velocity], axis=1)[:, self.channels]
+        found = np.ones((len(episode.sample), len(self.channels)), dtype=bool)
+        if self.efforts:
+            own = found[:, len(self.channels) - len(self.efforts) :]
+            own[:] = False if episode.effort is None else np.isfinite(episode.effort[:, list(self.efforts)])
+        return found if episode.reported is None else found & episode.reported[:, None]
 
     def windows(self, length: int, offset: int = 0) -> list[WindowData]:
         """Cut all episodes into windows that predict ``length`` samples, H; none starts before ``offset``.
@@ -400,10 +467,10 @@ class Problem:
                 continue
             starts = self.starts[index]
             # A jitter of the sample times does not show in velocities.
-            speed = np.concatenate([starts.velocity, np.zeros_like(starts.velocity)], axis=1)
+            still = np.zeros((len(starts.velocity), self.coordinates + len(self.efforts)))
+            speed = np.concatenate([starts.velocity, still], axis=1)
             std = self.noise.std(speed[:, self.channels])
-            if episode.reported is not None:
-                std = np.where(episode.reported[:, None], std, np.inf)
+            std = np.where(self._reported(index), std, np.inf)
             mean, spread, counts = self._prior(index, std)
             found.append(
                 WindowData(
@@ -429,8 +496,7 @@ class Problem:
         weak = np.array([VELOCITY_PRIOR_STD[unit] for unit in self.robot.coordinate_units])
         # The weak prior on velocities has mean zero; it only keeps the inverse finite.
         mean = np.concatenate([episode.position, np.zeros((T, C))], axis=1)
-        unseen = np.full((T, C), UNSEEN_STD)
-        spread = np.concatenate([unseen, np.repeat(weak[None], T, axis=0)], axis=1)
+        spread = np.concatenate([np.full((T, C), UNSEEN_STD), np.repeat(weak[None], T, axis=0)], axis=1)
         counts = np.concatenate([np.ones(C, dtype=bool), np.zeros(C, dtype=bool)])
         if episode.estimate_std is not None:
             estimate = np.broadcast_to(episode.estimate_std, (T, 2 * C))
@@ -438,8 +504,9 @@ class Problem:
             states = np.concatenate([episode.position, episode.velocity], axis=1)
             mean[:, known], spread[:, known] = states[:, known], estimate[:, known]
             counts |= known
-        mean[:, self.channels], spread[:, self.channels] = self.measured(index), std
-        counts[self.channels] = True
+        states = self.channels[self.channels < 2 * C]
+        mean[:, states], spread[:, states] = self.measured(index)[:, : len(states)], std[:, : len(states)]
+        counts[states] = True
         return mean, spread, counts
 
     def predict(
@@ -454,7 +521,7 @@ class Problem:
 
         Start positions and velocities are (W, C) or (N, W, C); the smoothed ones by default.
         """
-        batch = self.batch(len(theta))
+        batch = self.batch(len(theta), data.episode)
         batch.set_parameters(theta)
         path = setpoints(batch, self.episodes[data.episode], np.maximum(latency_s, 0.0))
         return self.predict_along(batch, path, data, position, velocity)
@@ -472,6 +539,8 @@ class Problem:
 
         ``force`` acts on the coordinates in each device period, (N, W, H * stride, C).
         """
+        shape = batch.count, len(data.windows), data.windows.length, len(self.efforts)
+        effort = np.empty(shape) if self.efforts else None
         x, v = predict_windows(
             batch,
             self.episodes[data.episode],
@@ -480,12 +549,14 @@ class Problem:
             data.start_velocity if velocity is None else velocity,
             path,
             force,
+            effort,
         )
         C, channels = x.shape[-1], self.channels
         if np.array_equal(channels, np.arange(C)):
             return MemberPrediction(x, x, v)
-        positions, velocities = x[..., channels[channels < C]], v[..., channels[channels >= C] - C]
-        return MemberPrediction(np.concatenate([positions, velocities], axis=-1), x, v)
+        speeds = channels[(channels >= C) & (channels < 2 * C)] - C
+        parts = [x[..., channels[channels < C]], v[..., speeds], *([] if effort is None else [effort])]
+        return MemberPrediction(np.concatenate(parts, axis=-1), x, v)
 
 
 def samples_in(problem: Problem, seconds: float) -> int:
@@ -507,18 +578,6 @@ def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
             if length <= 4:
                 raise
             length = max(int(0.8 * length), 4)
-
-
-def prediction_errors(
-    problem: Problem, members: Sequence[Member], seconds: float
-) -> Iterator[tuple[WindowData, FloatArray]]:
-    """Yield windows as :func:`longest_windows` and the errors of predictions from smoothed states there.
-
-    Errors are (N, W, H, M) for N members.
-    """
-    theta, latency = np.stack([m[0] for m in members]), np.array([m[1] for m in members])
-    for data in longest_windows(problem, seconds):
-        yield data, problem.predict(theta, latency, data).observed - data.measured
 
 
 def measurements(windows: Sequence[WindowData]) -> int:

@@ -214,7 +214,8 @@ def run_identity(
     """Return the digest of a run, which identifies its checkpoint; ``rng`` has not drawn yet.
 
     It covers the recordings' samples and commands, their given noise and latency, model, space, method with
-    its settings, budget, generator and versions. The number of threads changes no result and is left out.
+    its settings, budget, generator and versions. The number of threads and what does the
+    fits change no result and are left out.
 
     Raises:
         TypeError: The method holds a value without a digest, such as a function.
@@ -226,8 +227,11 @@ def run_identity(
     given = [f.name for f in dataclasses.fields(problem) if f.init]
     return digest(
         {
-            "problem": {k: getattr(problem, k) for k in given if k not in {"robot", "space", "threads"}},
+            "problem": {
+                k: getattr(problem, k) for k in given if k not in {"robot", "space", "threads", "tasks"}
+            },
             "model": model_digest(problem.robot),
+            "setups": {name: model_digest(robot) for name, robot in problem.robot.setups.items()},
             "description": problem.robot.description.to_json(),
             "space": problem.space.to_json(),
             "method": method,

@@ -85,7 +85,7 @@ def delay_columns(
     for k in range(P):
         late = begins[k::P]
         targets[1 + k, late] = episode.target[late - 1]
-    batch = problem.batch(1 + P)
+    batch = problem.batch(1 + P, data.episode)
     batch.set_parameters(np.repeat(theta[None], 1 + P, axis=0))
     path = setpoints(batch, episode, np.full(1 + P, latency_s), targets)
     observed = problem.predict_along(batch, path, data).observed

@@ -29,7 +29,7 @@ import scipy
 from deal_hw.calib.data.noise import autocorrelations
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.cluster_robust import Clustered, clustered
-from deal_hw.calib.fit.null_space import null_directions, null_space
+from deal_hw.calib.fit.null_space import expected_directions, null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calibration import EXPLAINED_CHI2, Z90, Identifiability, listed
@@ -84,6 +84,10 @@ WEAK_SHARE = 0.5
 
 BLIND_SHARE = 0.9
 """Share of the prior's standard deviation above which the data have no information [-]."""
+
+PRIOR_SHARE = 0.71
+"""Share of a prior's standard deviation above which the prior says more than the data [-]: half of the
+information is the prior's."""
 
 AT_BOUND = 1e-6
 """Distance to an end of the range, as share of the range, that counts as at the bound [-]."""
@@ -140,10 +144,14 @@ class Uncertainty:
     def verdicts(self) -> tuple[Identifiability, ...]:
         """How well the data determine each parameter, (K,)."""
         unit, prior_std = _unit(self.space), self.space.width / np.sqrt(12.0)
+        expected_std = self.space.prior[1]
         found: list[Identifiability] = []
         for k, std in enumerate(np.sqrt(np.diag(self.covariance))):
             if self.blind[k]:
                 found.append("not identifiable")
+            elif std > PRIOR_SHARE * expected_std[k]:
+                # It is known well enough, but not by the recordings.
+                found.append("weak")
             elif std <= IDENTIFIABLE_STD * unit[k]:
                 # What compensates for a known effect is a property of the fit, not of the robot.
                 found.append("weak" if self.space.names[k] in self.biased else "identifiable")
@@ -267,7 +275,10 @@ def uncertainty(
         covariance=covariance[:K, :K],
         interval=intervals(space, theta, covariance[:K, :K], blind, bound),
         latency_interval_s=latency,
-        null_directions=null_directions(space, unseen),
+        null_directions=(
+            *null_directions(space, unseen),
+            *expected_directions(space, data[:K, :K] / inflation),
+        ),
         alarms=_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
         inflation=inflation,
         blind=blind,

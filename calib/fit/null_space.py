@@ -40,6 +40,9 @@ variance comes from the other."""
 MOSTLY = 2.0
 """From this factor on, three quarters of the variance, they are confounded; below it partly [-]."""
 
+MOST_COMBINED = 8
+"""Most combinations that are described of those that a prior decides: whole inertias have dozens."""
+
 
 @dataclass(frozen=True, slots=True)
 class NullSpace:
@@ -129,6 +132,43 @@ def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]
     leave, them = ("leaves", "it") if len(alone) == 1 else ("leave", "them")
     ask = f"excite {them} or measure {them} by other means"
     return (*words, f"{', '.join(alone)} {leave} no trace in this recording: {ask}")
+
+
+def expected_directions(space: ParameterSpace, data: FloatArray) -> tuple[str, ...]:
+    """Describe the combinations of parameters of which a prior says more than the data.
+
+    Of the ten inertial parameters of each link of a robot on a fixed base, some act only together with those
+    of other links, and some not at all. With a CAD model as prior each has a value nevertheless.
+
+    Args:
+        space: The parameters.
+        data: Information of the data alone in each parameter's own scale, (K, K).
+    """
+    std = space.prior[1]
+    known, free = np.flatnonzero(np.isfinite(std)), np.flatnonzero(~np.isfinite(std))
+    if not known.size:
+        return ()
+    # What the parameters without a prior follow says nothing of the others. Their range keeps it invertible.
+    inner = data[np.ix_(free, free)] + np.diag(12.0 / space.width[free] ** 2)
+    cross = data[np.ix_(free, known)]
+    left = data[np.ix_(known, known)] - cross.T @ np.linalg.solve(inner, cross)
+    # In units of the priors: an eigenvalue below 1 is a direction in which the data say less.
+    values, vectors = np.linalg.eigh(left * np.outer(std[known], std[known]))
+    combined: dict[str, None] = {}
+    alone: list[str] = []
+    for direction in sparse_basis(vectors[:, values < 1.0].T):
+        share = direction / np.max(np.abs(direction))
+        parts = [int(k) for k in np.argsort(-np.abs(share)) if abs(share[k]) > 2 * NAMED_PART]
+        names = [space.names[known[k]] for k in parts]
+        if len(parts) == 1:
+            alone.append(names[0])
+        elif len(combined) < MOST_COMBINED:
+            signs = ["-" if share[k] * share[parts[0]] < 0 else "+" for k in parts]
+            together = " ".join(f"{sign} {name}" for sign, name in zip(signs, names, strict=True))
+            combined[f"{together.removeprefix('+ ')}: the prior says more than the recordings"] = None
+    if not alone:
+        return tuple(combined)
+    return (*combined, f"{', '.join(dict.fromkeys(alone))}: the prior says more than the recordings")
 
 
 def _describe(space: ParameterSpace, direction: FloatArray, parts: list[int]) -> str:

@@ -11,13 +11,13 @@ the correlation time. The search range serves as prior for the rest.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Member, Problem, WindowData, longest_windows, prediction_errors
+from deal_hw.calib.data.problem import Member, Problem, WindowData, longest_windows
 from deal_hw.calib.fit.residual import Normal, Point, Shooting
 from deal_hw.calib.fit.solver import (
     SolverSettings,
@@ -192,7 +192,10 @@ def standing_rmse(problem: Problem, seconds: float) -> FloatArray:
     """Return the same errors, (M,), of a robot whose state stays as it is at the start of each window."""
     squares, count = np.zeros(len(problem.channels)), np.zeros(len(problem.channels))
     for data in longest_windows(problem, seconds):
-        start = np.concatenate([data.start_position, data.start_velocity], axis=1)[:, None, problem.channels]
+        # A robot that stays as it is has an effort of 0 here.
+        still = np.zeros((len(data.windows), len(problem.efforts)))
+        start = np.concatenate([data.start_position, data.start_velocity, still], axis=1)
+        start = start[:, None, problem.channels]
         squares += np.sum(np.where(data.reported, start - data.measured, 0.0) ** 2, axis=(0, 1))
         count += np.sum(data.reported, axis=(0, 1))
     return np.asarray(np.sqrt(squares / np.maximum(count, 1)))
@@ -229,3 +232,15 @@ def _weighed(
         std = np.where(reported, scale * np.sqrt(correlation / weight), np.inf)
         data.append(dataclasses.replace(d, std=std))
     return plain.on(data, prior_share=prior_share), scale
+
+
+def prediction_errors(
+    problem: Problem, members: Sequence[Member], seconds: float
+) -> Iterator[tuple[WindowData, FloatArray]]:
+    """Yield windows as :func:`longest_windows` and the errors of predictions from smoothed states there.
+
+    Errors are (N, W, H, M) for N members.
+    """
+    theta, latency = np.stack([m[0] for m in members]), np.array([m[1] for m in members])
+    for data in longest_windows(problem, seconds):
+        yield data, problem.predict(theta, latency, data).observed - data.measured

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.contacts import START_ITERATIONS, fit_starts, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, restarted, solve
@@ -177,6 +177,17 @@ def refine(
     if result is None:
         raise InsufficientDataError("no window length was given")
     return result
+
+
+def from_start(
+    problem: Problem,
+    start: Member,
+    stages_s: Sequence[float] | None = None,
+    notify: Callable[[Refined], None] | None = None,
+) -> Refined:
+    """Refine from a start; a latency that the problem gives replaces the start's. See :func:`refine`."""
+    given = problem.fixed_latency_s
+    return refine(problem, start[0], start[1] if given is None else given, stages_s, notify=notify)
 
 
 def window_stages(problem: Problem) -> tuple[float, ...]:

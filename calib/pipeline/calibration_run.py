@@ -15,15 +15,17 @@ from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.findings import Finding
+from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
     from deal_hw.calib.fit.intervals import Uncertainty
     from deal_hw.calib.fit.output_error import OutputErrorFit
     from deal_hw.calib.fit.refinement import Refined
-    from deal_hw.calib.validation.wider_models import WiderFit
+    from deal_hw.calib.validation.explain import Tried
 
 SHARED_ERRORS = "errors that commands and measurements share"
+EXPLANATIONS = "laws that the model lacks"
 AFTER_FIT = "after the fit"
 """Names of checks."""
 
@@ -39,6 +41,8 @@ class FitOutcome:
         chi2: Mean squared residual over the noise variance.
         known: Uncertainty of the estimate.
         facts: More entries for the provenance: plain JSON values.
+        space: Parameters of the estimate, where fits may have more of them than the search, whose population
+            is then left out; None: the search's.
     """
 
     searched: CalibrationResult
@@ -47,6 +51,7 @@ class FitOutcome:
     chi2: float
     known: Uncertainty
     facts: Mapping[str, Any] = field(default_factory=dict)
+    space: ParameterSpace | None = None
 
     def with_alarms(
         self, *first: Finding, last: Sequence[Finding] = (), chi2: float | None = None, **facts: Any
@@ -68,7 +73,7 @@ class CalibrationRun:
         attempts: Runs the search on all recordings and stores its results.
         settings: Which checks to run.
         local: The local fit, if there is one.
-        play: The fit with play in the gears, if there is one.
+        tried: Laws that the model may lack, which were tried.
         progress: Receives progress reports.
         first_steps: Physics steps of the problem before this calibration.
         checks: Physics steps of each check so far, by its name.
@@ -81,7 +86,7 @@ class CalibrationRun:
     attempts: Restarts
     settings: Validation
     local: Refined | None = None
-    play: WiderFit | None = None
+    tried: tuple[Tried, ...] = ()
     progress: ProgressCallback | None = None
     first_steps: int = 0
     checks: dict[str, int] = field(default_factory=dict)
@@ -125,6 +130,13 @@ class CalibrationRun:
         if self.settings.thorough or steps <= self.check_steps_left:
             return True
         self.left_out[name] = "left out, since the checks would take longer than the fits"
+        return False
+
+    def may_try(self, name: str, steps: float) -> bool:
+        """Return whether a law may be tried before a search, which a fit with it may make needless."""
+        if self.settings.thorough or steps <= self.check_steps_left + self.search_steps:
+            return True
+        self.left_out[name] = "left out, since it would take longer than the fits"
         return False
 
     def say(self, stage: str, message: str = "", done: int = 0, total: int = 1, **candidate: Any) -> None:

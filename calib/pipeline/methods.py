@@ -29,8 +29,8 @@ SEARCH_VARIANTS = ("deal-critic", "deal-untrained", "deal-no-critic")
 DEFAULT_SEARCH: Final = "deal"
 """The search where none is named."""
 
-SEARCHING = frozenset({"default", "output-error"})
-"""Pipelines with a search."""
+SEARCHING = frozenset({"default", "output-error", "output-error-no-laws"})
+"""Pipelines with a search. What laws gain is measured beside the last one."""
 
 METHODS: dict[str, str] = {
     "default": "deal_hw.calib.pipeline.stages:CalibrationPipeline",
@@ -54,6 +54,7 @@ METHODS: dict[str, str] = {
     "mmd-unaligned": "deal_hw.calib.search.unaligned:by_kernel",
     "moments-unaligned": "deal_hw.calib.search.unaligned:by_moments",
     "output-error": "deal_hw.calib.pipeline.output_error_fits:output_error_method",
+    "output-error-no-laws": "deal_hw.calib.pipeline.output_error_fits:without_laws",
     "local": "deal_hw.calib.pipeline.output_error_fits:local",
     "gait": "deal_hw.calib.pipeline.output_error_fits:gait",
     "easi": "deal_hw.calib.baselines.easi:Easi",
@@ -81,6 +82,9 @@ NO_DATA_METHODS = frozenset(
 )
 """Baselines that must not read the data. They are never refined."""
 
+ENGINE_SEARCHES = frozenset({"deal", "deal-critic", "deal-untrained", "deal-no-critic", "eki", "random"})
+"""Searches whose populations the problem's engine simulates; all others take mujoco.batch."""
+
 UNALIGNED_METHODS = frozenset({"deal-unaligned", "mmd-unaligned", "moments-unaligned"})
 """Searches that compare distributions. A refinement would align what they do not."""
 
@@ -104,7 +108,7 @@ CLOSED_LOOP_METHODS = UNALIGNED_METHODS | frozenset(
 PAPER_POPULATION = 200
 """Number of simulators in the DEAL paper's Table 4."""
 
-WHOLE_METHODS = UNALIGNED_METHODS | {"output-error", "local", "gait", "mujoco-sysid"}
+WHOLE_METHODS = UNALIGNED_METHODS | {"output-error", "output-error-no-laws", "local", "gait", "mujoco-sysid"}
 """Methods with their own refinement, that align nothing, or that represent another tool. They are never
 refined."""
 
@@ -157,11 +161,13 @@ def usual_budget(
     return Budget(population=members, generations=generations or Budget().generations, refine=refine)
 
 
-def make_method(name: str, *, refine: bool = False, thorough: bool = False) -> CalibrationMethod[Problem]:
+def make_method(
+    name: str, *, refine: bool = False, thorough: bool = False, laws: bool = True
+) -> CalibrationMethod[Problem]:
     """Return a new method; see `check_method`.
 
     ``refine`` has no effect on baselines and whole methods; `default` without it is its search alone.
-    ``thorough``: checks run to their end where they take more physics steps than the fits.
+    ``thorough`` and ``laws`` are those of :class:`deal_hw.calib.validation.settings.Validation`.
     """
     from deal_hw.calib.pipeline.stages import CalibrationPipeline
     from deal_hw.calib.validation.settings import Validation
@@ -176,12 +182,13 @@ def make_method(name: str, *, refine: bool = False, thorough: bool = False) -> C
     else:
         made = _made(name)
     if isinstance(made, CalibrationPipeline):
-        made.settings = dataclasses.replace(made.settings, thorough=thorough)
+        laws = laws and made.settings.laws
+        made.settings = dataclasses.replace(made.settings, thorough=thorough, laws=laws)
         return made
     if not refine or name in NO_DATA_METHODS | WHOLE_METHODS:
         return made
     # Who compares searches wants each to run, even where refining the nominal values would be enough.
-    return CalibrationPipeline(made, name, Validation(local_first=False, thorough=thorough))
+    return CalibrationPipeline(made, name, Validation(local_first=False, thorough=thorough, laws=laws))
 
 
 def _factory(name: str) -> Callable[..., CalibrationMethod[Problem]]:

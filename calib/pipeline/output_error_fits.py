@@ -8,7 +8,7 @@ The right residual scale, the right window length, and whether to stop early dif
    the longer windows are fitted again from there.
 3. Cross-validation over the motions compares candidates by their prediction of unseen data. Candidates are
    the fits over short and long windows, that over the longest ones with a robust loss or without a latency,
-   and the search's estimate if it was the better start.
+   the search's estimate if it was the better start, and fits with a law that the model lacks.
 4. The best candidate is fitted to all data. Two halves of the data are compared, and confounded parameters
    are listed.
 
@@ -17,9 +17,11 @@ Held-out recordings take no part in any of this.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,16 +49,18 @@ from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, Fi
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
-from deal_hw.calibration import Z90, CalibrationMethod, CalibrationResult
+from deal_hw.calibration import Z90, Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
+from deal_hw.task_map import InThisProcess
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
+    from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice
     from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.checks import SplitHalf
-    from deal_hw.calib.validation.cross_validation import Choice
+    from deal_hw.calib.validation.explain import Allows
 
 # What follows the fits is imported where it is used, as in stages.py.
 
@@ -148,11 +152,18 @@ class OutputErrorFits(Fits):
         run.offer("fit of long windows", windows[-1])
         return dataclasses.replace(self, first=(short, *windows))
 
+    def tries_laws(self, run: CalibrationRun) -> bool:
+        """Return whether the cross-validation has candidates with laws."""
+        return run.settings.laws and run.settings.cross_validation
+
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice, screened_laws
         from deal_hw.calib.validation import checks
         from deal_hw.calib.validation.cross_validation import Choice
         from deal_hw.calib.validation.diagnosis import diagnose
+        from deal_hw.calib.validation.explain import refused
+        from deal_hw.calib.validation.explanations import EXPLANATIONS
 
         settings, (first, *windows) = self.settings, self.first or self.started(run).first
         # The recordings as they are fitted, which may be joined or a part.
@@ -166,12 +177,21 @@ class OutputErrorFits(Fits):
         better = self._better_start(problem, first, searched)
         if better:
             windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
-        choice = Choice("long", {}, settings.long_s, note="without folds")
+        decided = LawfulChoice(Choice("long", {}, settings.long_s, note="without folds"))
         if run.settings.cross_validation:
-            choice = self._choose(run, problem, seed, (first, *windows), search=better)
+            lengths = windows[0].recipe.seconds, settings.long_s
+            tried = screened_laws(run, problem, first, lengths) if self.tries_laws(run) else ()
+            decided = self._choose(run, problem, seed, (first, *windows), tried, search=better)
+        choice, law = decided.made, decided.law
         run.say("fit", f"{choice.chosen} on all recordings")
-        members = self._members(problem, first, windows, searched if better else None, choice.chosen)
+        searched_start = searched if better else None
+        laws = () if law is None else (law,)
+        members = self._members(problem, first, windows, searched_start, laws, choice.chosen)
         theta, latency_s = members[choice.chosen]
+        if law is not None:
+            problem = law.widened(problem)
+            # The local fit knows of no law.
+            run = dataclasses.replace(run, problem=law.widened(run.problem), local=None)
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
@@ -185,12 +205,16 @@ class OutputErrorFits(Fits):
         causes: tuple[Diagnosis, ...] | None = None
         judged = run.problem, local
         with run.check(AFTER_FIT):
-            if local is not None and left is not None:
+            if (local is not None or law is not None) and left is not None:
                 # A local fit that diverged has seen only a part of the recordings.
-                lost = local.chi2 >= LOCAL_HOPELESS
+                lost = local is None or local.chi2 >= LOCAL_HOPELESS
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
                 if judged[1] is not None and checks.unexplained(judged[1]):
-                    causes = diagnose(judged[0], judged[1], run.play, run.allows)
+                    allows: Allows = run.allows
+                    if self.tries_laws(run):
+                        # The cross-validation has judged laws already.
+                        allows = refused(allows, [law.name for law in EXPLANATIONS])
+                    causes = diagnose(judged[0], judged[1], run.tried, allows)
             split = self._split_half(run, problem, fit, recipe, known)
         known = checks.widened_by_split_half(known, split, latency_s, problem.latency_range_s)
         if settings.hold_first:
@@ -204,6 +228,9 @@ class OutputErrorFits(Fits):
         if causes is not None and judged[1] is not None:
             known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, causes)
         found = confounded(problem, fit.normal.hessian / known.inflation)
+        if law is not None:
+            known = known.with_alarms(law.finding(decided, theta))
+            facts["law"] = law.facts(decided, theta)
         names = problem.channel_names
         facts |= {
             "cross_validation": choice.to_json(),
@@ -224,7 +251,13 @@ class OutputErrorFits(Fits):
         words = dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))
         known = dataclasses.replace(known, null_directions=tuple(words))
         return FitOutcome(
-            searched=searched, theta=theta, latency_s=latency_s, chi2=chi2, known=known, facts=facts
+            searched=searched,
+            theta=theta,
+            latency_s=latency_s,
+            chi2=chi2,
+            known=known,
+            facts=facts,
+            space=problem.space,
         )
 
     def _searched(
@@ -259,37 +292,62 @@ class OutputErrorFits(Fits):
         problem: Problem,
         seed: int,
         whole: Sequence[OutputErrorFit],
+        laws: Sequence[LawCandidate],
         *,
         search: bool,
-    ) -> Choice:
+    ) -> LawfulChoice:
         """Fit every candidate without each fold and compare the predictions of that fold.
 
         Each fit of a fold continues from that of all recordings, ``whole``: the minimum is near, and a fit
         ends in it whatever its start. Without ``search``, that on all recordings was no better start, and no
-        fold is searched.
+        fold is searched. Fits with laws are candidates, too.
         """
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice
         from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, on_folds, time_masks
 
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
 
-        def fits(train: Problem, fold: int) -> dict[str, Member]:
+        def say(fold: int) -> None:
             question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"
             run.say("cross-validation", question)
-            first, *windows = [fit_output_error(train, *fit.member, fit.recipe) for fit in whole]
-            searched = None
-            if search:
-                rng = np.random.default_rng([seed, fold])
-                searched = run.attempts.search.run(self._reduced(train, first), run.budget, rng)
-            return self._members(train, first, windows, searched)
 
-        def errors(test: Problem, members: Sequence[Member]) -> FloatArray:
-            rmse = prediction_rmse(test, members, settings.long_s)
-            return np.array([_error(problem, of_channels) for of_channels in rmse])
+        # Sent to workers, so without the fits, which hold the recordings.
+        fits = partial(
+            dataclasses.replace(self, first=())._of_fold,
+            starts=[(fit.member, fit.recipe) for fit in whole],
+            seed=seed,
+            search=run.attempts.search if search else None,
+            budget=run.budget,
+            laws=laws,
+        )
+        errors = partial(_errors, laws=laws, seconds=settings.long_s)
+        on = problem
+        if search and problem.policy is not None:
+            # A search may run the policy, whose network cannot be sent.
+            on = copy.copy(problem)
+            on.tasks = InThisProcess()
+        found = on_folds(on, masks, fits, errors, "long", settings.long_s, say)
+        return LawfulChoice.of(dataclasses.replace(found, steps=problem.steps - before), laws)
 
-        found = on_folds(problem, masks, fits, errors, "long", settings.long_s)
-        return dataclasses.replace(found, steps=problem.steps - before)
+    def _of_fold(
+        self,
+        train: Problem,
+        fold: int,
+        starts: Sequence[tuple[Member, Recipe]],
+        seed: int,
+        search: CalibrationMethod[Problem] | None,
+        budget: Budget,
+        laws: Sequence[LawCandidate],
+    ) -> dict[str, Member]:
+        """Return every candidate from the data of a fold."""
+        first, *windows = [fit_output_error(train, *start, recipe) for start, recipe in starts]
+        searched = None
+        if search is not None:
+            rng = np.random.default_rng([seed, fold])
+            searched = search.run(self._reduced(train, first), budget, rng)
+        return self._members(train, first, windows, searched, laws)
 
     def _better_start(self, problem: Problem, first: OutputErrorFit, searched: CalibrationResult) -> bool:
         """Return whether the search's estimate predicts short windows better than the first fit."""
@@ -312,9 +370,10 @@ class OutputErrorFits(Fits):
         first: OutputErrorFit,
         windows: Sequence[OutputErrorFit],
         searched: CalibrationResult | None,
+        laws: Sequence[LawCandidate],
         only: str | None = None,
     ) -> dict[str, Member]:
-        """Return every candidate's estimate, or as many as ``only`` needs."""
+        """Return every candidate's estimate, those with laws last, or as many as ``only`` needs."""
         settings, found = self.settings, {"short": first.member}
         if searched is not None:
             found["search"] = searched.estimate, searched.latency_s
@@ -325,6 +384,9 @@ class OutputErrorFits(Fits):
                 theta, latency_s = found["long"]
                 latency_s = latency_s if recipe.latency else problem.first_latency_s
                 found[name] = fit_output_error(problem, theta, latency_s, recipe).member
+        for law in laws:
+            if only is None or only in law.names:
+                found |= law.members(problem, windows[0].member, fold=only is None)
         return found
 
     def _split_half(
@@ -360,6 +422,11 @@ def output_error_method(
 ) -> CalibrationPipeline:
     """Return `output-error`: fits by cross-validation, after the local fit and a search."""
     return CalibrationPipeline(search, name, fits=OutputErrorFits())
+
+
+def without_laws(search: CalibrationMethod[Problem], name: str) -> CalibrationPipeline:
+    """Return `output-error-no-laws`: the same, with no law that the model lacks."""
+    return CalibrationPipeline(search, name, Validation(laws=False), fits=OutputErrorFits())
 
 
 def local() -> CalibrationPipeline:
@@ -430,6 +497,18 @@ def _joined_stretches(problem: Problem) -> Problem:
     """Return the problem with consecutive stretches joined, so that long windows fit."""
     episodes = joined(problem.episodes)
     return problem.on(episodes, problem.known_std) if len(episodes) < len(problem.episodes) else problem
+
+
+def _errors(
+    test: Problem, members: Sequence[Member], laws: Sequence[LawCandidate], seconds: float
+) -> FloatArray:
+    """Return the errors of the members' predictions over a time [s], (N,); the last members have laws."""
+    plain = [one for one in members if len(one[0]) == len(test.space)]
+    rmse = list(prediction_rmse(test, plain, seconds))
+    for law in laws:
+        each = members[len(rmse) :][: len(law.names)]
+        rmse += list(prediction_rmse(law.widened(test), each, seconds))
+    return np.array([_error(test, of_channels) for of_channels in rmse])
 
 
 def _error(problem: Problem, rmse: FloatArray) -> float:

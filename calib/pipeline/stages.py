@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
+from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
@@ -36,6 +37,7 @@ from deal_hw.calib.fit.refinement import (
     LOCAL_HOPELESS,
     LOCAL_S,
     Refined,
+    from_start,
     local_fit,
     part_of,
     refine,
@@ -43,6 +45,7 @@ from deal_hw.calib.fit.refinement import (
 )
 from deal_hw.calib.pipeline.calibration_run import (
     AFTER_FIT,
+    EXPLANATIONS,
     SHARED_ERRORS,
     CalibrationRun,
     FitOutcome,
@@ -65,6 +68,7 @@ from deal_hw.types import FloatArray
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
     from deal_hw.calib.validation.cause_words import Diagnosis
+    from deal_hw.calib.validation.explain import Explained, Tried
     from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
@@ -113,6 +117,10 @@ class Fits(abc.ABC):
         They come before everything that takes long. There are none by default.
         """
         return self
+
+    def tries_laws(self, run: CalibrationRun) -> bool:
+        """Return whether fits with laws that the model lacks are among the candidates."""
+        return False
 
     @abc.abstractmethod
     def best(self, run: CalibrationRun) -> FitOutcome:
@@ -175,7 +183,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
         from deal_hw.calib.fit.channel_weights import weight_channels
-        from deal_hw.calib.validation.diagnosis import PLAY, fit_play
+        from deal_hw.calib.validation.explain import FAR, try_explanations
 
         # Another minimum can leave a residual as small as noise, but with a pattern.
         white = local is not None and conclusive(problem, local, WHITE_SAMPLES)
@@ -195,10 +203,13 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 local = with_rows(local)
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
-            if local is not None and self.settings.diagnosis:
-                with run.check(PLAY):
-                    run = dataclasses.replace(run, play=fit_play(problem))
-            found = with_play(run) or with_shared_error(fits, run)
+            # Around a poor fit only play would be fitted; see `try_explanations`.
+            later = local is not None and local.chi2 > FAR and self.fits.tries_laws(run)
+            if local is not None and self.settings.diagnosis and not later:
+                with run.check(EXPLANATIONS):
+                    tried = try_explanations(problem, with_rows(local), run.may_try)
+                run = dataclasses.replace(run, tried=tried)
+            found = with_explanation(run) or with_shared_error(fits, run)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
@@ -219,6 +230,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         return dataclasses.replace(
             searched,
             method=self.name,
+            space=found.space or searched.space,
+            population=None if len(found.theta) > len(searched.space) else searched.population,
             estimate=found.theta,
             interval=known.interval,
             covariance=known.covariance,
@@ -317,12 +330,15 @@ def lower_minimum(
     if searched is not None and searched.population is not None:
         near = rng.permutation(searched.population)[: len(starts) // 2]
         starts = [(theta, searched.latency_s) for theta in near] + starts[: len(starts) - len(near)]
-    for theta, latency_s in starts:
-        if (again or best is not same) and conclusive(part, best, WHITE_SAMPLES):
+    fits = in_order(part, partial(from_start, stages_s=shortest), starts)
+    while not ((again or best is not same) and conclusive(part, best, WHITE_SAMPLES)):
+        if (tried := next(fits, None)) is None:
             break
-        tried = refined_from(run_part, theta, latency_s, shortest)
+        if np.isfinite(tried.chi2):
+            run.offer("refinement", tried)
         if clearly_lower(tried, best):
             best = tried
+    fits.close()
     if best is same and not again:
         return None
     lower = refined_from(run, best.theta, best.latency_s)
@@ -401,7 +417,7 @@ def conclude_fit(
     if late is not None:
         known = late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
-        known, checked = judge(problem, refined, known, run.settings, run.play, run.allows)
+        known, checked = judge(problem, refined, known, run.settings, run.tried, run.allows)
     if doubt or unexplained(refined):
         # Delays were found because the fit with a constant one is not right.
         known = hold_windows(known, refined.latency_s, refined if late is None else late.before)
@@ -463,28 +479,41 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
     return found.with_alarms(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
 
 
-def with_play(run: CalibrationRun) -> FitOutcome | None:
-    """Return the fit with play in the gears as more parameters, if only noise is left then; otherwise None.
+def with_explanation(run: CalibrationRun) -> FitOutcome | None:
+    """Return the fit with a law that the model lacks, if only noise is left then; otherwise None.
 
     No search follows: nothing but noise is left to explain.
     """
-    from deal_hw.calib.validation.diagnosis import PLAY, find_play
+    from deal_hw.calib.validation.explain import explained, rivals
 
-    if run.local is None or run.play is None:
+    if run.local is None or not run.tried or not run.settings.laws:
         return None
-    with run.check(PLAY):
-        play = find_play(run.problem, run.local, run.play)
-    if play is None or not play.explains:
+    with run.check(EXPLANATIONS):
+        found = explained(run.problem, run.local, run.tried)
+    if not found or not found[0].explains:
         return None
-    wide = dataclasses.replace(run, problem=play.problem, progress=None)
-    fit = refined_from(wide, play.theta, play.latency_s)
-    if not conclusive(play.problem, fit):
+    best, *others = rivals(found)
+    wide = dataclasses.replace(run, problem=best.problem, progress=None)
+    fit = refined_from(wide, best.theta, best.latency_s)
+    if not conclusive(best.problem, fit):
         return None
-    added = play.problem.space.names[-len(play.diagnosis.subject) :]
-    do = f"Repair the gear. Until then use this result: it has the play as {listed(added)}."
-    alarm = dataclasses.replace(play.diagnosis, do=do)
+    do = best.explanation.taken.replace("{}", listed(best.added))
+    if others:
+        names = [one.explanation.name for one in others]
+        do += f" Recordings like these do not tell it from {listed(names)}."
+    alarm = dataclasses.replace(best.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    return conclude_fit(wide, None, fit).with_alarms(alarm, diagnosis=[play.diagnosis.to_json()])
+    return conclude_fit(wide, None, fit).with_alarms(
+        alarm,
+        diagnosis=[one.diagnosis.to_json() for one in (best, *others)],
+        explanations=explanation_rows(run.tried, found),
+    )
+
+
+def explanation_rows(tried: Sequence[Tried], found: Sequence[Explained]) -> list[dict[str, Any]]:
+    """Return the explanations that were tried as plain JSON values, with what each explains."""
+    by_name = {one.explanation.name: one for one in found}
+    return [one.to_json(by_name.get(one.explanation.name)) for one in tried]
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
@@ -568,11 +597,4 @@ def refined_from(
     run: CalibrationRun, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None = None
 ) -> Refined:
     """Refine from a search's estimate or another start."""
-    given = run.problem.fixed_latency_s
-    return refine(
-        run.problem,
-        theta,
-        latency_s if given is None else given,
-        stages_s,
-        notify=partial(run.offer, "refinement"),
-    )
+    return from_start(run.problem, (theta, latency_s), stages_s, partial(run.offer, "refinement"))

@@ -162,7 +162,8 @@ def _title(episode: SampledEpisode, other: str, parts: Counter[str]) -> str:
     if not episode.name:
         return other
     between = f", {episode.time_s[0]:.4g} to {episode.time_s[-1]:.4g} s"
-    return episode.name + (between if parts[episode.name] > 1 else "")
+    setup = f", set-up {episode.setup}" if episode.setup else ""
+    return episode.name + setup + (between if parts[episode.name] > 1 else "")
 
 
 def _overlay(

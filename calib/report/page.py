@@ -21,10 +21,12 @@ from deal_hw.calib.report.verdict import grouped, make_story, trust
 from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
-from deal_hw.parameters import Parameter
+from deal_hw.parameters import Parameter, ParameterDistribution
 from deal_hw.sim.engine.model import RobotModel, at_step
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 from deal_hw.sim.mjcf.exports import write_exports
+from deal_hw.sim.parameters import present
+from deal_hw.sim.parameters.effort import EFFORT_KINDS
 
 DISTRIBUTION = "distribution.json"
 MODEL = "calibrated.xml"
@@ -32,7 +34,16 @@ TRACE = "trace.npz"
 REPORT = "report.html"
 TEMPLATE = "report.html.j2"
 
-_HIDDEN = ("heldout_rmse", "latency_scan", "search_estimate", "versions", "settings", "budget", "split_half")
+_HIDDEN = (
+    "heldout_rmse",
+    "cross_validation",
+    "latency_scan",
+    "search_estimate",
+    "versions",
+    "settings",
+    "budget",
+    "split_half",
+)
 """Provenance that the page shows elsewhere."""
 
 
@@ -126,6 +137,7 @@ def render(inputs: ReportInputs) -> str:
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
         strong=charts.STRONG,
         trace=charts.trace(result.trace),
+        compared=compared_fits(_mapping(provenance.get("cross_validation"))),
         population=[]
         if result.population is None
         else [
@@ -232,6 +244,42 @@ def short(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}" if math.isfinite(value) else "–"
 
 
+@dataclass(frozen=True, slots=True)
+class ComparedFit:
+    """A candidate of the cross-validation.
+
+    Attributes:
+        name: Its name: the length of its windows, and what it has that others lack.
+        errors: Its error in each fold, in units of the sensor's noise.
+        ratio: Its error over that of the chosen one, geometric mean of the folds.
+        chosen: Whether it was chosen.
+    """
+
+    name: str
+    errors: tuple[float, ...]
+    ratio: float
+    chosen: bool
+
+
+def compared_fits(choice: Mapping[str, Any]) -> list[ComparedFit]:
+    """Return the candidates of a cross-validation, best first; nothing where none were compared.
+
+    Args:
+        choice: :meth:`deal_hw.calib.validation.cross_validation.Choice.to_json`.
+    """
+    errors, chosen = _mapping(choice.get("errors")), choice.get("chosen")
+    if chosen not in errors:
+        return []
+
+    def mean(name: str) -> float:
+        return float(np.exp(np.mean(np.log(errors[name]))))
+
+    return [
+        ComparedFit(name, tuple(errors[name]), mean(name) / mean(chosen), name == chosen)
+        for name in sorted(errors, key=mean)
+    ]
+
+
 def _mapping(value: Any) -> dict[str, Any]:
     return dict(value) if isinstance(value, dict) else {}
 
@@ -261,7 +309,7 @@ def write_result(
             found = trust(result)
             judged = {"verdict": found.colour, "verdict_reason": found.sentence}
             write_json(waiting / RESULT_FILE, result.to_json() | judged)
-            write_json(waiting / DISTRIBUTION, result.distribution().to_json() | judged)
+            write_json(waiting / DISTRIBUTION, model_distribution(robot, result).to_json() | judged)
             np.savez(waiting / TRACE, **_trace(result))
             if report is not None:
                 write_report(waiting / REPORT, report)
@@ -281,6 +329,18 @@ def write_result(
     return {name: folder / name for name in names}
 
 
+def model_distribution(robot: RobotModel, result: CalibrationResult) -> ParameterDistribution:
+    """Return the calibrated distribution of the parameters that act on the robot's own model.
+
+    A payload is in a set-up only, and what an effort sensor reports moves nothing. Both are in the result,
+    but no policy is trained with them.
+    """
+    here = present(result.space, robot.absent)
+    sensors = [kind.name for kind in EFFORT_KINDS]
+    idle = (p.name for p in here.parameters if not p.elements or p.kind in sensors)
+    return result.distribution().without(idle)
+
+
 def write_model(robot: RobotModel, result: CalibrationResult, path: Path) -> tuple[Path, ...]:
     """Write the calibrated MJCF, with the physics step of the fit; see :func:`write_calibrated_mjcf`."""
     step_s = result.provenance.get("fit_step_s")
@@ -290,7 +350,7 @@ def write_model(robot: RobotModel, result: CalibrationResult, path: Path) -> tup
         result.estimate,
         path,
         result.latency_s,
-        f"method {result.method}, distribution {result.distribution().digest()}",
+        f"method {result.method}, distribution {model_distribution(robot, result).digest()}",
         result.without_value,
         trust(result).colour,
         result.biased,

@@ -29,11 +29,11 @@ from deal_hw.calib.fit.intervals import (
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.diagnosis import Allows, all_allowed, diagnose
+from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
+from deal_hw.calib.validation.explain import Allows, Tried
 from deal_hw.calib.validation.residual_place import unexplained_alarm
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
-from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Z90, listed
 from deal_hw.findings import Finding
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
@@ -151,7 +151,7 @@ def judge(
     refined: Refined,
     known: Uncertainty,
     settings: Validation,
-    fitted: WiderFit | None = None,
+    tried: Sequence[Tried] = (),
     allows: Allows = all_allowed,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
@@ -163,7 +163,7 @@ def judge(
         refined: Its fit, with linearised residuals.
         known: The fit's uncertainty.
         settings: Which checks to run.
-        fitted: A fit with play.
+        tried: Laws that the model may lack, which were tried.
         allows: Which of the long ones may run.
     """
     facts: dict[str, Any] = {
@@ -181,7 +181,7 @@ def judge(
     if settings.physics_step:
         known, facts["physics_step"] = with_step(problem, refined, known)
     asked = settings.diagnosis and unexplained(refined)
-    causes = diagnose(problem, refined, fitted, allows) if asked else ()
+    causes = diagnose(problem, refined, tried, allows) if asked else ()
     if settings.split_half:
         split = check_split_half(problem, refined, known, allows)
         known = widened_by_split_half(known, split, refined.latency_s, problem.latency_range_s)

@@ -5,13 +5,16 @@ The folds are parts of the fitted recordings; held-out recordings stay unseen.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -59,25 +62,44 @@ def on_folds(
     errors: Callable[[Problem, Sequence[Member]], FloatArray],
     usual: str,
     window_s: float,
+    say: Callable[[int], None] = lambda fold: None,
 ) -> Choice:
     """Fit every candidate without each fold and compare the predictions of that fold.
 
     For each fold, ``masks`` hold the samples of each recording that it leaves out, (T,) each. ``fits`` makes
     all candidates from a fold's data and its number, ``errors`` returns each one's prediction error on a
-    part, (N,). ``usual`` is taken where nothing is better or no fold can be fitted.
+    part, (N,); both are sent to workers where the problem has some. ``usual`` is taken where nothing is
+    better or no fold can be fitted. ``say`` is called with the number of each fold that is waited for.
     """
     found: dict[str, list[float]] = {}
-    for fold, left_out in enumerate(masks):
-        try:
-            members = fits(problem.part([~mask for mask in left_out]), fold)
-            each = errors(problem.part(left_out), list(members.values()))
-        except (InsufficientDataError, CalibrationError) as err:
-            return Choice(usual, {}, window_s, note=f"a fold's data cannot be fitted: {err}")
-        for name, value in zip(members, each, strict=True):
-            found.setdefault(name, []).append(float(value))
+    folds = in_order(problem, partial(_on_fold, fits=fits, errors=errors), list(enumerate(masks)))
+    with contextlib.closing(folds):
+        for fold in range(len(masks)):
+            say(fold)
+            each = next(folds)
+            if isinstance(each, str):
+                return Choice(usual, {}, window_s, note=f"a fold's data cannot be fitted: {each}")
+            for name, value in each.items():
+                found.setdefault(name, []).append(value)
     means = {name: float(np.mean(np.log(values))) for name, values in found.items()}
     chosen = min(means, key=lambda name: (means[name], name != usual))
     return Choice(chosen, {n: tuple(v) for n, v in found.items()}, window_s)
+
+
+def _on_fold(
+    problem: Problem,
+    fold: tuple[int, Sequence[npt.NDArray[np.bool_]]],
+    fits: Callable[[Problem, int], Mapping[str, Member]],
+    errors: Callable[[Problem, Sequence[Member]], FloatArray],
+) -> dict[str, float] | str:
+    """Return each candidate's error in a fold, or why the fold's data cannot be fitted."""
+    number, left_out = fold
+    try:
+        members = fits(problem.part([~mask for mask in left_out]), number)
+        each = errors(problem.part(left_out), list(members.values()))
+    except (InsufficientDataError, CalibrationError) as err:
+        return str(err)
+    return dict(zip(members, map(float, each), strict=True))
 
 
 def fold_numbers(count: int, folds: int, rounds: int) -> IntArray:

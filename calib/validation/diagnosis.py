@@ -1,47 +1,40 @@
 """Causes of an unexplained residual and the next repair, chosen on motion that was not fitted.
 
-Three kinds of evidence use one statistic. Play in the gears is a candidate model: refitted on a part of the
-recordings, it predicts the rest. Other causes have signatures, which a regression adds to the parameters:
-fitted on some windows, they predict the others. Their statistic is the held-out deviance: twice the
-logarithm of the likelihood ratio, with an estimated noise level. A random delay predicts no sample, but where
-the residual is large: beside random forces of constant size, it must make the residual likelier.
+Three kinds of evidence use one statistic. Laws that the model lacks are candidate models (`.explain`):
+refitted on a part of the recordings, they predict the rest. Other causes have signatures, which a regression
+adds to the parameters (`.evidence`). A random delay predicts no sample, but where the residual is large:
+beside random forces of constant size, it must make the residual likelier.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+import functools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, ended_at_bound
+from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import kurtosis
-from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, SearchedKinds, advice, stretch_words
-from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.signatures import Cause, Signature, SignatureResponse, answers, signatures
-from deal_hw.calib.validation.wider_models import (
-    WiderFit,
-    fit_wider,
-    gain_of,
-    wider_cost,
-    zero_parameters,
+from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, advice, stretch_words
+from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
+from deal_hw.calib.validation.explain import (
+    DECISIVE,
+    SURE,
+    Allows,
+    Tried,
+    explained,
+    try_explanations,
 )
+from deal_hw.calib.validation.random_delay import random_delay
+from deal_hw.calib.validation.signatures import Cause, Signature
+from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost, zero_parameters
 from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
-
-FOLDS = 4
-"""Number of folds over the windows."""
-
-ROUNDS = 2
-"""Stretches of consecutive windows that each fold leaves out."""
 
 NOTICED = 0.03
 """Least share of the held-out squared residual that a signature explains [-]."""
@@ -51,9 +44,6 @@ MOST_CAUSES = 3
 
 ALIKE = 0.8
 """Least explained share of a named body's mass, relative to the best one's [-]."""
-
-DECISIVE = 0.5
-"""Share explained by play from which other causes are searched only after its repair [-]."""
 
 POOR = 9.0
 """Chi2 that a cause may leave without explaining the share ``decisive`` [-]. Effects are computed around
@@ -65,21 +55,6 @@ REVERSALS = 0.2
 
 ALONE = 2.0
 """Least ratio of play's deviance to that of each other signature in a poor fit [-]."""
-
-MOST_PLAY = 0.5
-"""Widest play, as a share of the commands' span [-]."""
-
-LEAST_PLAY = 0.2
-"""Least play of a named joint, as a share of the widest one [-]."""
-
-SURE = 5.0
-"""Least value of a named parameter that is 0 in the model, in its standard deviations [-]."""
-
-PARAMETER_PRIOR = 0.5
-"""Spread of parameters in the regression, as a share of their range [-]."""
-
-LATENCY_PRIOR_S = 0.02
-"""Spread of the latency in the regression [s]."""
 
 BURST_PART = 0.05
 """Bursts occupy at most this part of the time [-]."""
@@ -97,12 +72,8 @@ BURST_LEFT = 4.0
 """Chi2 that bursts may leave: twice the noise [-]."""
 
 
-Allows = Callable[[str, float], bool]
-"""Whether a check, by name, may run that takes at most so many physics steps."""
-
-PLAY = "play in the gears"
 ZEROS = "what is 0 in the model"
-"""Names of checks."""
+"""Name of a check."""
 
 
 def all_allowed(name: str, steps: float) -> bool:
@@ -119,141 +90,10 @@ ZERO_CAUSES: Mapping[str, Cause] = {
 """Cause that a parameter stands for which is 0 in the model."""
 
 
-@dataclass(frozen=True, slots=True)
-class Play:
-    """Play in the gears, found by fitting a model with it to a part of the recordings.
-
-    Attributes:
-        diagnosis: Play as the cause of the residual.
-        problem: The recordings, with the named joints' plays as more parameters.
-        theta: The fit's values of these parameters.
-        latency_s: Its latency [s].
-        chi2: Mean squared residual over the noise variance, of motion that was not fitted.
-    """
-
-    diagnosis: Diagnosis
-    problem: Problem
-    theta: FloatArray
-    latency_s: float
-    chi2: float
-
-    @property
-    def explains(self) -> bool:
-        """Whether it leaves only noise of motion that was not fitted, and less than half of the residual."""
-        return self.chi2 < MISMATCH_CHI2 and self.diagnosis.share >= DECISIVE
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Evidence for a diagnosis; regressions on it leave the start states free.
-
-    Attributes:
-        rows: Linearised residuals, per episode.
-        prior: Information on the parameters and the latency, (P,).
-        found: Signatures of the causes.
-        answers: Responses of the windows to commands, per episode; empty if unknown, or if each command's
-            delay was an unknown of the fit.
-        period_s: Sampling period [s].
-        time_s: Time of each sample in its recording, per episode (W, H) [s].
-        names: Names of the recordings, per episode.
-        searched: What the fit searched.
-    """
-
-    rows: Sequence[WindowRows]
-    prior: FloatArray
-    found: Sequence[Signature]
-    answers: Sequence[SignatureResponse]
-    period_s: float
-    time_s: Sequence[FloatArray]
-    names: Sequence[str]
-    searched: SearchedKinds = field(default_factory=SearchedKinds)
-
-    @cached_property
-    def _following(self) -> list[FloatArray]:
-        return [rows.following for rows in self.rows]
-
-    @cached_property
-    def _rest(self) -> list[FloatArray]:
-        return [rows.rest for rows in self.rows]
-
-    @cached_property
-    def _columns(self) -> dict[int, list[FloatArray]]:
-        """Each signature's columns without what start states explain, by its identity."""
-
-        def left(rows: WindowRows, x: FloatArray) -> FloatArray:
-            # Rows of the start states' prior are 0.
-            return rows.without_starts(np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0))))
-
-        return {id(s): list(map(left, self.rows, s.columns)) for s in self.found}
-
-    def _design(self, taken: Sequence[Signature]) -> list[FloatArray]:
-        """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
-        columns = [self._columns[id(s)] for s in taken]
-        return [np.concatenate(parts, axis=2) for parts in zip(self._following, *columns, strict=True)]
-
-    def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return each window's normal matrix, (W, n, n), and vector, (W, n), squares, (W,), and the prior."""
-        design = self._design(taken)
-        matrix = np.concatenate([np.einsum("wri,wrj->wij", x, x) for x in design])
-        vector = np.concatenate(
-            [np.einsum("wri,wr->wi", x, r) for x, r in zip(design, self._rest, strict=True)]
-        )
-        squares = np.concatenate([np.sum(r**2, axis=1) for r in self._rest])
-        own = np.einsum("wii->i", matrix)
-        prior = np.append(self.prior, 1e-6 * own[len(self.prior) :] + 1e-12)
-        return matrix, vector, squares, prior
-
-    def coefficients(self, taken: Sequence[Signature]) -> FloatArray:
-        """Return the regression's coefficients on all windows, parameters first, (P + n,)."""
-        matrix, vector, _, prior = self._normal(taken)
-        return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
-
-    def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
-        """Return the residual after the regression, (W, R) per episode."""
-        found = self.coefficients(taken)
-        return [r - x @ found for x, r in zip(self._design(taken), self._rest, strict=True)]
-
-    def without(self, taken: Sequence[Signature]) -> list[WindowRows]:
-        """Return the rows without what signatures explain beside the parameters; start states stay free."""
-        found = self.coefficients(taken)[len(self.prior) :]
-        left = []
-        for e, rows in enumerate(self.rows):
-            residual, first = rows.residual.copy(), 0
-            for signature in taken:
-                columns = signature.columns[e]
-                n = columns.shape[2]
-                residual[:, : columns.shape[1]] -= columns @ found[first : first + n]
-                first += n
-            left.append(dataclasses.replace(rows, residual=residual))
-        return left
-
-    @cached_property
-    def count(self) -> int:
-        """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
-        measured = sum(int(np.count_nonzero(r)) for r in self._rest)
-        return max(measured - sum(len(r.start) * int(r.start.shape[2]) for r in self.rows), 1)
-
-    def held_out(self, taken: Sequence[Signature]) -> float:
-        """Return the total cost of each fold's windows with the regression fitted to the others."""
-        matrix, vector, squares, prior = self._normal(taken)
-        fold = fold_numbers(len(squares), FOLDS, ROUNDS)
-        cost = 0.0
-        for k in range(FOLDS):
-            mine, others = fold == k, fold != k
-            found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
-            each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
-            cost += float(each[mine].sum())
-        return cost
-
-    def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
-        """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
-        return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
-
-
 def diagnose(
     problem: Problem,
     refined: Refined,
-    fitted: WiderFit | None = None,
+    tried: Sequence[Tried] = (),
     allows: Allows = all_allowed,
 ) -> tuple[Diagnosis, ...]:
     """Return the causes of a fit's residual, best supported first; the fit has linearised residuals.
@@ -261,15 +101,12 @@ def diagnose(
     Args:
         problem: The problem.
         refined: Its fit.
-        fitted: A fit with play, if there is one of this problem.
+        tried: Explanations that were tried; those of this problem are not tried again.
         allows: Which fits of wider models may be made.
     """
-    wider: list[Diagnosis] = []
-    if may_have_play(problem) and allows(
-        PLAY, wider_cost(problem, fitted is None or fitted.of is not problem)
-    ):
-        found_play = find_play(problem, refined, fitted)
-        wider += [] if found_play is None else [found_play.diagnosis]
+    known = functools.cache(lambda: evidence(problem, refined))
+    tried = try_explanations(problem, refined, allows, tried, known)
+    wider = [one.diagnosis for one in explained(problem, refined, tried)]
     if not any(one.share >= DECISIVE for one in wider):
         more = [] if problem.noise_free else zero_parameters(problem)
         if more and allows(ZEROS, wider_cost(problem, True)):
@@ -278,95 +115,14 @@ def diagnose(
     if decisive:
         return tuple(decisive)
     wider = [one for one in wider if supported(one.share, refined.chi2)]
-    found = name_causes(evidence(problem, refined), refined.chi2)
+    named = {one.code for one in wider}
+    found = [one for one in name_causes(known(), refined.chi2) if one.code not in named]
     return tuple(sorted((*found, *wider), key=lambda f: -f.deviance))
 
 
 def supported(share: float, chi2: float) -> bool:
     """Return whether a cause that explains a share of a residual is more than an accident of a poor fit."""
     return share >= DECISIVE or chi2 * (1 - share) <= POOR
-
-
-def evidence(problem: Problem, refined: Refined) -> Evidence:
-    """Return the evidence for :func:`diagnose`."""
-    space, data = problem.space, refined.shooting.data
-    width = np.append(PARAMETER_PRIOR * space.width, LATENCY_PRIOR_S)
-    # A parameter at the end of its range cannot explain more.
-    free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
-    episodes = [problem.episodes[d.episode] for d in data]
-    return Evidence(
-        rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
-        prior=1 / width**2,
-        found=signatures(problem, refined),
-        answers=answers(problem, refined) if problem.command_delays is None else [],
-        period_s=problem.episodes[0].period_s,
-        time_s=[
-            np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
-            for e, d in zip(episodes, data, strict=True)
-        ],
-        names=[e.name for e in episodes],
-        searched=SearchedKinds.of(problem, refined.theta),
-    )
-
-
-def may_have_play(problem: Problem) -> bool:
-    """Return whether a model with play in the gears can be fitted: to servos on a fixed base."""
-    known = any(p.kind == "servo_play" for p in problem.space.parameters)
-    fixed = problem.robot.base is None and not problem.noise_free
-    return problem.robot.description.actuation == "position" and fixed and not known
-
-
-def fit_play(problem: Problem) -> WiderFit | None:
-    """Fit a model with play in every gear to a part of the recordings; None where it cannot be fitted."""
-    description, names = problem.robot.description, problem.robot.actuator_names
-    if not may_have_play(problem):
-        return None
-    span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
-    coordinate_units = problem.robot.coordinate_units[problem.robot.joints]
-    units = dict(zip(description.joint_names, coordinate_units, strict=True))
-    plays = [
-        Parameter(
-            name=f"{name}.play",
-            kind="servo_play",
-            elements=(name,),
-            unit=units[joint],
-            nominal=0.0,
-            low=0.0,
-            high=MOST_PLAY * float(most),
-            scale="linear",
-        )
-        for name, joint, most in zip(names, description.actuated, span, strict=True)
-        if most > 0
-    ]
-    return fit_wider(problem, plays)
-
-
-def find_play(problem: Problem, refined: Refined, fitted: WiderFit | None = None) -> Play | None:
-    """Compare predictions with play in the gears and without, of samples that the fit with play has not seen.
-
-    The fit without play, ``refined``, has used all recordings. ``fitted`` is the fit with play; it is made
-    where it is of another problem, or missing.
-    """
-    wide = fitted if fitted is not None and fitted.of is problem else fit_play(problem)
-    if wide is None:
-        return None
-    gained = gain_of(wide, refined)
-    if gained is None:
-        return None
-    plays, fit, found = wide.more, wide.fit, wide.found
-    order = [k for k in np.argsort(-found) if found[k] >= LEAST_PLAY * found.max() > 0]
-    named = [plays[k] for k in order]
-    joints = [play.elements[0] for play in named]
-    sizes = listed([f"{found[k]:.2g} {plays[k].unit} at {plays[k].elements[0]}" for k in order])
-    seen_words = (
-        f"With play in the gears ({sizes}) the model predicts motion that it was not fitted to with chi2 "
-        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: backlash."
-    )
-    looks = LOOKS["backlash"]
-    alarm = Finding.alarm(seen_words, looks[1], looks[2].replace("{}", listed(joints)))
-    cause = Diagnosis.of("backlash", gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))
-    theta = np.concatenate([fit.theta[: len(problem.space)], found[order]])
-    return Play(cause, problem.with_more(named), theta, fit.latency_s, wide.prediction.chi2)
 
 
 def find_zero(problem: Problem, refined: Refined, more: Sequence[Parameter]) -> list[Diagnosis]:
@@ -406,7 +162,7 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     """
     found: list[Diagnosis] = []
     taken: list[Signature] = []
-    groups = _groups(known.found)
+    groups = groups_of(known.found)
     while groups and len(found) < MOST_CAUSES:
         groups = [group for group in groups if _possible(known, taken, group)]
         gains = [known.gain(taken, group) for group in groups]
@@ -440,7 +196,7 @@ def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
     Effects of masses and friction are those around the fit, which is not the robot. Play acts where the
     measured motion or load turns round, wherever the parameters are.
     """
-    groups = [group for group in _groups(known.found) if _possible(known, [], group)]
+    groups = [group for group in groups_of(known.found) if _possible(known, [], group)]
     rivals = [known.gain([], group) for group in groups if group[0].cause != "backlash"]
     for group in (group for group in groups if group[0].cause == "backlash"):
         gain = known.gain([], group)
@@ -448,15 +204,6 @@ def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
         if share >= REVERSALS and gain >= ALONE * max(rivals, default=0.0):
             return _cause_diagnosis(known, [], group, share, gain)
     return None
-
-
-def _groups(found: Sequence[Signature]) -> list[list[Signature]]:
-    """Return the units of the selection: a cause at all joints, or the mass of one body."""
-    causes = dict.fromkeys(s.cause for s in found if s.cause != "mass")
-    return [
-        *([s for s in found if s.cause == cause] for cause in causes),
-        *([s] for s in found if s.cause == "mass"),
-    ]
 
 
 def _possible(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> bool:

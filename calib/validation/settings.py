@@ -24,5 +24,8 @@ class Validation:
     diagnosis: bool = True
     """Name causes of an unexplained residual."""
 
+    laws: bool = True
+    """Take a law that the model lacks into the fit where it predicts better; otherwise it is only named."""
+
     thorough: bool = False
     """Run checks to their end where they take more physics steps than the fits."""

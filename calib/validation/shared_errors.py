@@ -9,7 +9,6 @@ docs/explanation/calibration.md lists them.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
 import math
@@ -24,6 +23,7 @@ from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
+from deal_hw.sim.engine.model import at_step
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
@@ -118,8 +118,7 @@ class ChannelChange:
         steps = changed[0].step_s / robot.step_s
         if abs(steps - round(steps)) < 1e-6 and round(steps) >= 1:
             return problem.on(changed, std)
-        robot = dataclasses.replace(robot, model=copy.copy(robot.model))
-        robot.model.opt.timestep = changed[0].step_s / math.ceil(steps)
+        robot = at_step(robot, changed[0].step_s / math.ceil(steps))
         return dataclasses.replace(problem, robot=robot, episodes=changed, known_std=std)
 
 
@@ -298,7 +297,7 @@ def find_shared_error(
     ``local`` is the fit of the original recordings; None where it diverged. ``tell`` is called before each
     fit, with the number of those that are done and of all. No fit begins after ``most_steps`` physics steps.
     """
-    if problem.robot.base is not None or problem.noise_free:
+    if problem.robot.base is not None or problem.noise_free or problem.efforts:
         return SharedErrorCheck()
     before = problem.steps
     parts = [s for e in problem.episodes for s in stretches(e, STRETCH_S) if s.usable.any()]

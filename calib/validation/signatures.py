@@ -21,7 +21,9 @@ from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
-Cause = Literal["friction", "backlash", "delay", "damping", "inertia", "lag", "load", "mass", "contact"]
+Cause = Literal[
+    "friction", "backlash", "delay", "damping", "inertia", "lag", "load", "mass", "contact", "drive"
+]
 
 
 PUSH = 0.2
@@ -93,7 +95,7 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             theta[1:, len(fit.theta) :] *= 1 + HEAVIER * np.eye(len(heavier))
             late = np.full(len(theta), fit.latency_s)
             masses = wide.predict(theta, late, data, x, v).observed
-            for p, column in zip(heavier, _changes(masses, data) / HEAVIER, strict=True):
+            for p, column in zip(heavier, whitened_changes(masses, data) / HEAVIER, strict=True):
                 found.setdefault(("mass", p.elements[0]), []).append(column[..., None])
         path = _path(problem, fit, data)
         position, velocity, acceleration = _along(problem, data, *states[data.episode])
@@ -110,7 +112,7 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             force = np.zeros((1 + len(each), *velocity.shape[:2], C))
             force[1:, ..., c] = size * np.stack([shape for _, shape in each])
             pushed = _predict(problem, fit, data, e, np.repeat(path, len(force), axis=0), force)
-            columns = np.moveaxis(_changes(pushed, data), 0, -1)
+            columns = np.moveaxis(whitened_changes(pushed, data), 0, -1)
             number = {cause: [k for k, (own, _) in enumerate(each) if own == cause] for cause in forces}
             of_cause = {cause: columns[..., mine] for cause, mine in number.items()}
             if geared:
@@ -220,7 +222,7 @@ def _late_damping(
     servo = list(problem.robot.description.actuated_index).index(c - problem.robot.joints.start)
     first = recorded.sample[data.windows.start][:, None]
     at = np.minimum(first + np.arange(velocity.shape[1]), path.shape[1] - 1)
-    batch = problem.batch(1)
+    batch = problem.batch(1, data.episode)
     batch.set_parameters(fit.theta[None])
     stiffness, damping, limit = (
         batch.servo_factor(kind)[0, servo] * sent[at, servo]
@@ -273,7 +275,7 @@ def _inertia(problem: Problem, coordinate: int) -> float:
 
 def _path(problem: Problem, fit: Refined, data: WindowData) -> FloatArray:
     """Return the set-points of an episode at a fit's values, (1, S, A)."""
-    batch = problem.batch(1)
+    batch = problem.batch(1, data.episode)
     batch.set_parameters(fit.theta[None])
     return setpoints(batch, problem.episodes[data.episode], np.array([max(fit.latency_s, 0.0)]))
 
@@ -286,13 +288,13 @@ def _predict(
     path: FloatArray,
     force: FloatArray | None = None,
 ) -> FloatArray:
-    batch = problem.batch(len(path))
+    batch = problem.batch(len(path), data.episode)
     batch.set_parameters(np.repeat(fit.theta[None], len(path), axis=0))
     start = fit.point.position[e], fit.point.velocity[e]
     return problem.predict_along(batch, path, data, *start, force).observed
 
 
-def _changes(observed: FloatArray, data: WindowData) -> FloatArray:
+def whitened_changes(observed: FloatArray, data: WindowData) -> FloatArray:
     """Return the whitened differences of members from the first, (1 + n, W, H, M), as (n, W, H M)."""
     change = np.nan_to_num(observed[1:] - observed[:1], nan=0.0, posinf=0.0, neginf=0.0)
     return data.whitened(change).reshape(*change.shape[:2], -1)

@@ -101,7 +101,7 @@ def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
     return WiderFit(problem, more, fit, prediction)
 
 
-def wider_cost(problem: Problem, fits: bool) -> float:
+def wider_cost(problem: Problem, fits: bool, more: int = 0) -> float:
     """Return about how many physics steps a wider model takes, with its fit or from one.
 
     Each fit takes about half of its most iterations. The model as it is gets one, too.
@@ -109,7 +109,7 @@ def wider_cost(problem: Problem, fits: bool) -> float:
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
     periods = min(LOCAL_S, total_s / 2) / problem.robot.step_s
     # Derivatives by each value and start state, and a line of damped steps.
-    members = 2 + len(problem.space) + 2 * problem.coordinates + 10
+    members = 2 + len(problem.space) + more + 2 * problem.coordinates + 10
     predictions = total_s / problem.robot.step_s
     return 6.0 * members * periods * (2 if fits else 1) + 2.0 * predictions
 
@@ -143,6 +143,20 @@ def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
     return gained(again if again.chi2 < without.chi2 else without)
 
 
+def motion(problem: Problem) -> tuple[FloatArray, FloatArray]:
+    """Return the joints' rms speed and the rms force that their inertia needed, (J,) each."""
+    robot = problem.robot
+    inertia = robot.model.dof_M0[list(robot.qvel)]
+    joints = range(problem.coordinates)[robot.joints]
+    speed, push = np.zeros(len(inertia)), np.zeros(len(inertia))
+    for j, c in enumerate(joints):
+        moved = [s.velocity[:, c] for s in problem.starts]
+        speed[j] = np.sqrt(np.mean(np.concatenate(moved) ** 2))
+        accelerations = [np.gradient(v, e.period_s) for v, e in zip(moved, problem.episodes, strict=True)]
+        push[j] = inertia[j] * np.std(np.concatenate(accelerations))
+    return speed, push
+
+
 def zero_parameters(problem: Problem) -> list[Parameter]:
     """Return friction, damping and armature of joints that have none in the model and were not searched."""
     robot, searched = problem.robot, {(p.kind, e) for p in problem.space.parameters for e in p.elements}
@@ -150,13 +164,7 @@ def zero_parameters(problem: Problem) -> list[Parameter]:
         return []
     names = list(robot.description.joint_names)
     inertia = robot.model.dof_M0[list(robot.qvel)]
-    joints = range(problem.coordinates)[robot.joints]
-    speed, push = np.zeros(len(names)), np.zeros(len(names))
-    for j, c in enumerate(joints):
-        moved = [s.velocity[:, c] for s in problem.starts]
-        speed[j] = np.sqrt(np.mean(np.concatenate(moved) ** 2))
-        accelerations = [np.gradient(v, e.period_s) for v, e in zip(moved, problem.episodes, strict=True)]
-        push[j] = inertia[j] * np.std(np.concatenate(accelerations))
+    speed, push = motion(problem)
     most = {
         "dof_armature": MOST_INERTIA * inertia,
         "dof_frictionloss": MOST_FORCE * push,

@@ -121,9 +121,10 @@ def table(settings: FixedRange | Mismatch) -> RowTable:
         run_cell,
         population=settings.population,
         generations=settings.generations,
-        threads=settings.threads,
+        threads=settings.cell_threads,
     )
-    cells = Cells(names=KEY, runs=[(cell.key, partial(run, cell)) for cell in make_cells(settings)])
+    args = [(cell.key, (cell,)) for cell in make_cells(settings)]
+    cells = Cells(names=KEY, run=run, args=args, tasks=settings.tasks(), bench=settings.name)
     return RowTable(cells=cells, line=line, summary=print_summary, draw=draw)
 
 

@@ -165,16 +165,17 @@ def table(settings: Loop) -> RowTable:
         range_ratio=settings.range_ratio,
         train=settings.train,
         folder=settings.beside("policies"),
-        threads=settings.threads,
+        threads=settings.cell_threads,
     )
-    runs = [
+    args = [
         (
             (settings.profile, seed, method, settings.range_ratio),
-            partial(run, settings.profile, seed, method),
+            (settings.profile, seed, method),
         )
         for seed, method in itertools.product(settings.seeds, settings.methods)
     ]
-    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=print_summary, draw=draw)
+    cells = Cells(names=KEY, run=run, args=args, tasks=settings.tasks(), bench=settings.name)
+    return RowTable(cells=cells, line=line, summary=print_summary, draw=draw)
 
 
 def loop_row(

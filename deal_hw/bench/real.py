@@ -21,7 +21,7 @@ from deal_hw.bench.figures import draw
 from deal_hw.bench.rows import Cells, RowTable, noted_in
 from deal_hw.bench.settings import Real
 from deal_hw.bench.tables import line, print_real
-from deal_hw.calib.pipeline.methods import check_method, is_default
+from deal_hw.calib.pipeline.methods import check_method, divided, is_default
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
@@ -39,8 +39,8 @@ from deal_hw.workflows.calibration.settings import (
 from deal_hw.workflows.say import silent, to_stderr
 
 KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
-UNTOLD = frozenset({"nominal", "output-error"})
-"""Methods that need no expected prediction error."""
+UNTOLD = frozenset({"nominal", "output-error", "output-error-no-laws"})
+"""Pipelines that need no expected prediction error."""
 
 
 def source_of(settings: Real) -> CalibrateSettings:
@@ -114,7 +114,7 @@ def expected_std(
         return fit_output_error(problem, work.space.nominal, problem.first_latency_s, SHORT).expected_std
 
     def std(method: str) -> FloatArray | None:
-        return given if given is not None or method in UNTOLD else fitted()
+        return given if given is not None or divided(method)[0] in UNTOLD else fitted()
 
     return std
 
@@ -139,15 +139,16 @@ def table(settings: Real) -> RowTable:
         task,
         split,
         expected=expected,
-        threads=settings.threads,
+        threads=settings.cell_threads,
         budget=settings.budget,
         window_s=settings.heldout_window,
     )
-    runs = []
+    args = []
     for seed, method in itertools.product(settings.seeds, settings.methods):
         cell = (method, is_default(method) or settings.refine_all, settings.range_ratio, seed)
-        runs.append(((task, split, *cell), partial(run, *cell)))
-    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=print_real, draw=draw)
+        args.append(((task, split, *cell), cell))
+    cells = Cells(names=KEY, run=run, args=args, tasks=settings.tasks(), bench=settings.name)
+    return RowTable(cells=cells, line=line, summary=print_real, draw=draw)
 
 
 def run_cell(
@@ -231,7 +232,7 @@ def result_part(result: CalibrationResult, window_s: float) -> dict[str, Any]:
         "null_directions": list(result.null_directions),
         **{
             name: result.provenance.get(name)
-            for name in ("cross_validation", "split_half", "confounded", "heldout_rmse")
+            for name in ("law", "cross_validation", "split_half", "confounded", "heldout_rmse")
         },
         "estimate": dict(zip(result.space.names, map(float, result.estimate), strict=True)),
     }

@@ -16,8 +16,10 @@ from typing import Annotated, ClassVar, Final, Literal
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
+from deal_hw.scale.where import task_map
+from deal_hw.task_map import TaskMap
 from deal_hw.workflows.calibration.settings import Recordings
-from deal_hw.workflows.options import OneWord, Ratio, Threads
+from deal_hw.workflows.options import OneWord, Ratio, RayPlace, Threads
 
 MOST_SEEDS: Final = 10_000
 """Most seeds of one range."""
@@ -128,6 +130,30 @@ class SeededBench(Bench):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SpreadBench(SeededBench):
+    """A bench whose cells can run in workers: they share nothing, and none is there to be timed."""
+
+    ray: RayPlace = None
+    """Run cells in workers of Ray: local (as many as the processors allow), local:N, the HOST:PORT of a
+    cluster of which this machine is a node, or auto for the one that runs here (docs/how-to/cluster.md). The
+    rows are the same, but for times. Each cell then takes one processor, or --threads of them."""
+
+    @property
+    def cell_threads(self) -> int | None:
+        """Simulation threads of a cell; None for all CPUs."""
+        return 1 if self.ray is not None and self.threads is None else self.threads
+
+    def tasks(self) -> TaskMap:
+        """Return what runs the cells.
+
+        Raises:
+            ConfigurationError: --ray names no place.
+            MissingExtraError: Ray is not installed.
+        """
+        return task_map(self.ray, self.cell_threads)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SearchingBench(SeededBench):
     """A bench whose methods have one budget."""
 
@@ -158,7 +184,7 @@ class TaskBench(SeededBench):
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownTruth(TaskBench):
+class KnownTruth(TaskBench, SpreadBench):
     """A bench that calibrates robots whose truth it knows."""
 
     work: ClassVar[str] = "deal_hw.bench.calibration:table"
@@ -221,7 +247,7 @@ class Mismatch(KnownTruth):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Loop(SeededBench):
+class Loop(SpreadBench):
     """Collect, calibrate, train and deploy on emulated cart-poles whose truth only the bench knows."""
 
     name: ClassVar[str] = "loop"
@@ -242,12 +268,18 @@ class Loop(SeededBench):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Go2Loop(SeededBench):
-    """Record walks of emulated Go2, calibrate, fine-tune the shipped policy, and walk again."""
+class Go2Loop(SpreadBench):
+    """Record walks of emulated Go2, calibrate, fine-tune the shipped policy, and walk again.
+
+    With --task climb, robots climb platforms of 0.05 to 0.25 m, told and blind; with canter they canter.
+    """
 
     name: ClassVar[str] = "go2-loop"
     work: ClassVar[str] = "deal_hw.bench.go2_loop:table"
     example: ClassVar[str] = "--seeds 0,1"
+
+    task: Literal["walk", "canter", "climb"] = "walk"
+    """What the robots do."""
 
     profile: Profile = "sensor"
     """Profile of the emulated robots."""
@@ -318,7 +350,7 @@ class Speed(TaskBench):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Real(SearchingBench):
+class Real(SearchingBench, SpreadBench):
     """Compare methods on recordings of a real robot (--model, --data) by their errors on held-out motion."""
 
     name: ClassVar[str] = "real"
@@ -351,7 +383,7 @@ class Real(SearchingBench):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verdict(SearchingBench):
+class Verdict(SearchingBench, SpreadBench):
     """Calibrate robots in plain MuJoCo with and without deliberate faults.
 
     Tests whether verdicts accept right models and reject wrong ones.

@@ -48,12 +48,12 @@ def table(settings: Speed) -> RowTable:
     run = partial(
         run_cell, profile=settings.profile, range_ratio=settings.range_ratio, threads=settings.threads
     )
-    runs = []
+    args = []
     for task, seed, method in itertools.product(settings.task, settings.seeds, settings.methods):
         members = settings.population or usual_population(method)
         cell = (task, settings.space, method, members, settings.generations, seed)
-        runs.append((cell, partial(run, *cell)))
-    return RowTable(cells=Cells(names=KEY, runs=runs), line=line, summary=printed(summary))
+        args.append((cell, cell))
+    return RowTable(cells=Cells(names=KEY, run=run, args=args), line=line, summary=printed(summary))
 
 
 def run_cell(
@@ -147,14 +147,14 @@ def bare_step_s(problem: Problem, population: int) -> tuple[float, float]:
     from deal_hw.calib.paper.fitness import FitnessSettings
     from deal_hw.calib.paper.rollouts import control_ticks, policy_of, rollout_population
     from deal_hw.sim.engine.closed_loop import on_physics_steps
-    from deal_hw.sim.engine.servo import slew
+    from deal_hw.sim.laws.setpoints import slew
 
     episode = problem.episodes[0]
     most = FitnessSettings().most_transitions(problem.robot.description.name)
     ticks = control_ticks(problem, 0, most, policy_of(problem).history)
     theta = problem.space.sample(np.random.default_rng(0), population)
     action = rollout_population(problem, Members(theta, np.zeros(population)), 0, ticks)[2]
-    batch = problem.batch(population)
+    batch = problem.batch(population, 0)
     batch.set_parameters(theta)
     first, (begin, end) = int(ticks.sample[0]), (int(ticks.start[0]), int(ticks.start[-1]))
     limit = batch.servo_factor("servo_speed_limit")[:, None] * episode.speed_limit[None, begin:end]

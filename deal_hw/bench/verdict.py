@@ -84,9 +84,10 @@ def table(settings: Verdict) -> RowTable:
     Raises:
         UnknownNameError: There is no such robot or fault.
     """
-    run = partial(run_cell, budget=settings.budget, threads=settings.threads)
+    run = partial(run_cell, budget=settings.budget, threads=settings.cell_threads)
     chosen = robots(settings.seeds, settings.problems, settings.faults)
-    cells = Cells(names=KEY, runs=[(cell, partial(run, *cell)) for cell in chosen])
+    args = [(cell, cell) for cell in chosen]
+    cells = Cells(names=KEY, run=run, args=args, tasks=settings.tasks(), bench=settings.name)
     return RowTable(cells=cells, line=line, summary=printed(summary))
 
 
@@ -211,6 +212,8 @@ def against_truth(robot: PlainRobot, result: CalibrationResult) -> dict[str, Any
 def line(row: Mapping[str, Any]) -> str:
     """Return one row in words."""
     what = row["fault"] or "right model"
+    if row["error"]:
+        return f"{row['task']} seed {row['seed']}, {what}: {row['error']}"
     named = "" if not row["fault"] or _right(row["fault"]) else ", named" if row["named"] else ", NOT named"
     text = f"{row['task']} seed {row['seed']}, {what}: {row['colour']}{named}"
     if "seconds" in row:

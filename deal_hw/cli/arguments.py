@@ -13,13 +13,13 @@ import itertools
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from types import MappingProxyType, NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import tyro
 
 from deal_hw.errors import ConfigurationError, short
-from deal_hw.ranges import option
+from deal_hw.ranges import hints_of, once_a_class, option
 from deal_hw.workflows.kinds import Arguments, groups, has, listed
 from deal_hw.workflows.options import FROM_PYTHON, OneWord
 
@@ -93,17 +93,19 @@ class Option:
         return f"{self.shown} is: {_meaning(self.owner, self.name)}".rstrip(". ")
 
 
-def options_of(settings: type[Any]) -> dict[str, Option]:
+@once_a_class
+def options_of(settings: Any) -> Mapping[str, Option]:
     """Return the options and arguments of settings by field name, those of groups included."""
     found: dict[str, Option] = {}
-    hints = get_type_hints(settings, include_extras=True)
+    hints = hints_of(settings)
     for entry in dataclasses.fields(settings):
         hint = hints[entry.name]
         kinds = tuple(_kinds(hint))
         if not is_option(hint):
             continue
         if inner := list(groups(hint)):
-            found |= {name: one for group in inner for name, one in options_of(group).items()}
+            for group in inner:
+                found |= options_of(group)
             continue
         tuples = [kind for kind in kinds if get_origin(kind) is tuple]
         count: int | None = 0 if kinds == (bool,) else 1
@@ -126,7 +128,7 @@ def options_of(settings: type[Any]) -> dict[str, Option]:
             positional=is_positional(settings, entry.name, hint),
             on=count == 0 and entry.default is True,
         )
-    return found
+    return MappingProxyType(found)
 
 
 def is_positional(owner: Any, name: str, hint: Any) -> bool:
@@ -160,18 +162,26 @@ def _kinds(hint: Any) -> Iterator[Any]:
 
 def _meaning(owner: type[Any], name: str) -> str:
     """Return a field's description on one line, from the sources."""
-    for part in owner.__mro__:
-        try:
-            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(part))).body
-        except (OSError, TypeError):
-            continue
-        body = tree.body if isinstance(tree, ast.ClassDef) else []
-        for line, text in itertools.pairwise(body):
-            if isinstance(line, ast.AnnAssign) and getattr(line.target, "id", "") == name:
-                value = text.value if isinstance(text, ast.Expr) else None
-                if isinstance(value, ast.Constant) and isinstance(value.value, str):
-                    return " ".join(value.value.split())
-    return ""
+    return next((text for part in owner.__mro__ if (text := _meanings(part).get(name))), "")
+
+
+@once_a_class
+def _meanings(settings: Any) -> dict[str, str]:
+    """Return the descriptions of a class's own fields; empty if it has no source."""
+    try:
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(settings))).body
+    except (OSError, TypeError):
+        return {}
+    found: dict[str, str] = {}
+    for line, text in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
+        value = text.value if isinstance(text, ast.Expr) else None
+        if (
+            isinstance(line, ast.AnnAssign)
+            and isinstance(value, ast.Constant)
+            and isinstance(value.value, str)
+        ):
+            found.setdefault(getattr(line.target, "id", ""), " ".join(value.value.split()))
+    return found
 
 
 def _is_option_word(word: str) -> bool:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import tyro
 
 from deal_hw.calibration import Progress, ProgressCallback
-from deal_hw.cli.calibrate_output import print_files, print_result, print_verdict, show_progress
+from deal_hw.cli.calibrate_output import print_files, print_lost, print_result, print_verdict, show_progress
 from deal_hw.cli.json_output import only_document
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -188,10 +188,14 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     with _without_windows():
         work = calibration_input(config, say=say)
     method = usual_method(config, work, say)
+    from deal_hw.sim.parameters import present
+
+    # What is shown is the robot without set-up.
+    shown = present(work.space, work.robot.absent)
     with (
         results.resumable(),
         watching(
-            config.watch, config.watch_save, work.space, work.robot.description, work.shown, config.latency
+            config.watch, config.watch_save, shown, work.robot.description, work.shown, config.latency
         ) as watch,
         show_progress(f"calibrate ({method})", config.quiet) as bar,
     ):
@@ -221,6 +225,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     if not config.quiet:
         print_result(report.result, work.advice, work.name)
         print_files(report.files)
+        print_lost(report.result)
         _print_next(report, work.name, results.path.parent)
         print_verdict(report.result)
     return report

@@ -74,6 +74,17 @@ def print_files(files: Mapping[str, Path]) -> None:
         print(f"see all results: open {files['report.html']} in a browser")
 
 
+def print_lost(result: CalibrationResult) -> None:
+    """Print the laws of actuators that the tables of other simulators cannot express, if there are any."""
+    from deal_hw.sim.mjcf.exports import laws_without_a_field
+
+    if lost := laws_without_a_field(result):
+        print(
+            f"Isaac Lab, mjlab and a URDF have no field for {', '.join(lost)}: their tables are without "
+            "(`cannot_express`); calibrated.xml with deal_hw.sim.actuators.ActuatorLaws has them"
+        )
+
+
 def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
     """Print the parameters, what the data do not determine, what to record next, and the held-out error.
 

@@ -27,13 +27,15 @@ from deal_hw.ranges import Checked, Range
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.kinds import InputKind, Kinds
-from deal_hw.workflows.options import Seed
+from deal_hw.workflows.options import Seed, given, refuse
 from deal_hw.workflows.running.report import RunReport
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+PLATFORM_M = 0.1
+"""Height of the platform that a Go2 climbs in the demo [m]."""
 END_WIDTH = 110
 """Width of the demo's final output [columns]."""
 
@@ -46,8 +48,8 @@ class Demo(Checked):
     """cartpole balances its pole, go2 walks, so101 reaches poses."""
 
     out: Path | None = None
-    """Run folder, by default runs/demo (go2: runs/demo_go2, so101: runs/demo_so101). A former demo in it is
-    deleted."""
+    """Run folder, by default runs/demo (others: runs/demo_go2, demo_canter, demo_climb, demo_so101). A former
+    demo in it is deleted."""
 
     profile: Literal["ideal", "sensor", "realistic"] = "realistic"
     """Sensor effects of the emulated robot, as for `deal-hw emulate`."""
@@ -56,7 +58,8 @@ class Demo(Checked):
     """Seed of the hidden truth, the motion, the search and the training."""
 
     episodes: Annotated[int | None, Range(1, 1000)] = None
-    """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s. SO-101: 1 of 16 s."""
+    """Deployments of each policy. Cart-pole: 3 of 10 s. Go2: 1 walk of 17 s, or 3 climbs of 6 s. SO-101: 1 of
+    16 s."""
 
     steps: Annotated[int | None, Range(1, 10**9)] = None
     """Training steps. Cart-pole: by default as many as for the shipped UDR policy. Go2: 300,000, starting
@@ -81,13 +84,29 @@ class DemoCartpole(Demo):
 
 @dataclass(frozen=True, kw_only=True)
 class DemoGo2(Demo):
-    """Record, calibrate, retrain, deploy and compare on an emulated Go2, which walks."""
+    """Record, calibrate, retrain, deploy and compare on an emulated Go2, which walks, canters or climbs."""
 
     transport: Literal["dds", "zenoh"] = "dds"
     """The wire."""
 
+    task: Literal["walk", "canter", "climb"] = "walk"
+    """What it does: walk, canter, or climb a platform."""
+
+    platform: Annotated[float, Range(0.02, 0.3, "m")] = PLATFORM_M
+    """Height of the platform that it climbs [m]."""
+
     on_stand: bool = False
     """Calibrate from a recording with the body on a stand instead of from the walk."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.task != "climb":
+            refuse(given(self, type(self), ["platform"]), "only --task climb has a platform")
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return self.out or Path("runs") / f"demo_{self.robot if self.task == 'walk' else self.task}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +242,7 @@ def demo(config: Demo) -> DemoReport:
     clear(config.folder)
     folder, stages = RunFolder(config.folder), Stages()
     with folder:
-        settings = ("robot", "transport", "profile", "episodes", "steps", "on_stand")
+        settings = ("robot", "transport", "profile", "episodes", "steps", "on_stand", "task", "platform")
         folder.start(
             {"kind": "demo", **{name: getattr(config, name, False) for name in settings}},
             {"demo": config.seed},

@@ -128,6 +128,11 @@ GO2: Final = RobotEntry(
     task="deal_hw.policies.tasks:GO2",
     environment="deal_hw/Go2-v0",
     policy="deal_hw.policies:assets/go2_walk.onnx",
+    tasks={"canter": "deal_hw.policies.tasks:CANTER", "climb": "deal_hw.policies.tasks:CLIMB"},
+    policies={
+        "canter": "deal_hw.policies:assets/go2_canter.onnx",
+        "climb": "deal_hw.policies:assets/go2_climb.onnx",
+    },
     motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
 )
 GO2_ON_STAND: Final = RobotEntry(

@@ -126,6 +126,8 @@ class RobotEntry:
         task: The training task, a :class:`~deal_hw.policies.tasks.TrainingTask`.
         environment: Gymnasium's name of the task, such as ``"deal_hw/Ant-v0"``.
         policy: The shipped policy, ``"package:file"``.
+        tasks: Further training tasks, as ``task``, by name.
+        policies: Their shipped policies, as ``policy``, by the task's name.
         motors: The joints in the order of the vendor's motor numbers, by which policies of other trainers
             name them.
         needs: What pip installs for it; named where an import fails.
@@ -148,6 +150,8 @@ class RobotEntry:
     task: Reference = ""
     environment: str = ""
     policy: str = ""
+    tasks: Mapping[str, Reference] = field(default_factory=dict)
+    policies: Mapping[str, str] = field(default_factory=dict)
     motors: Reference = ""
     needs: str = ""
     origin: str = ""

@@ -336,16 +336,22 @@ def balanced(name: str, trajectory: Trajectory) -> BalanceResult | None:
     return found
 
 
-def training_task(name: str) -> TrainingTask:
+def training_task(name: str, task: str = "") -> TrainingTask:
     """Return a robot's training task.
 
+    Args:
+        name: The robot.
+        task: The name of one of its further tasks; "" for its usual one.
+
     Raises:
-        UnknownNameError: There is none; the message lists the robots.
+        UnknownNameError: There is none; the message lists the robots, or the robot's further tasks.
     """
     if not has_task(name):
         raise UnknownNameError("robot with a training environment", name, trained_robots())
     entry = robot_entry(name)
-    found: TrainingTask = entry.load(entry.task)
+    if task and task not in entry.tasks:
+        raise UnknownNameError(f"task of robot {name!r}", task, tuple(entry.tasks))
+    found: TrainingTask = entry.load(entry.tasks[task] if task else entry.task)
     return found
 
 

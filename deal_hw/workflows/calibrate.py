@@ -41,7 +41,9 @@ class Calibration:
     @property
     def distribution(self) -> ParameterDistribution:
         """The calibrated distribution of the parameters, for training a policy."""
-        return self.result.distribution()
+        from deal_hw.calib.report.page import model_distribution
+
+        return model_distribution(self.inputs.robot, self.result)
 
     @property
     def colour(self) -> str:

@@ -24,7 +24,7 @@ from deal_hw.workflows.running.settings import (
 )
 from deal_hw.workflows.running.supervised import recording_folder, run_episodes
 from deal_hw.workflows.running.view import RunView
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import policy_file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,8 @@ class DeploySettings(RunOptions):
     """The robot, such as cartpole."""
 
     policy: File | None = None
-    """The policy (.onnx); by default the robot's shipped one."""
+    """The policy (.onnx), or canter or climb for those that are shipped for a Go2; by default the robot's
+    shipped one."""
 
     seconds: RunSeconds = 10.0
     """Length of an episode [s]."""
@@ -135,7 +136,7 @@ def deploy(settings: DeploySettings) -> RunReport:
 
 def run(config: DeploySettings, view: RunView) -> RunReport:
     """Run the policy, as :func:`deploy`, and show it."""
-    policy = config.policy or shipped_policy(config.robot)
+    policy = policy_file(config.robot, config.policy)
     plan = RunPlan(
         **plan_options(config.robot, config.link, legs_of(config), crane=crane_of(config)),
         motion="balance",

@@ -12,9 +12,10 @@ import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.ranges import hints_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +212,7 @@ def groups(hint: Any) -> Iterator[type[Any]]:
 def field_names(settings: Any) -> frozenset[str]:
     """Return the names of all fields of settings, those of groups included."""
     names: set[str] = set()
-    hints = get_type_hints(settings, include_extras=True)
+    hints = hints_of(settings)
     for name in (entry.name for entry in dataclasses.fields(settings)):
         names.add(name)
         inner: list[Any] = list(groups(hints[name]))

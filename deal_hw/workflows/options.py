@@ -40,6 +40,8 @@ File = Path | str
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Threads = Annotated[int | None, Range(1, 1024)]
 RunSeconds = Annotated[float, Range(0.02, 3600, "s")]
+RayPlace = str | None
+"""Where tasks run: local, local:N, HOST:PORT or auto; None for this process."""
 Share = Annotated[float, Range(0, 1)]
 Ratio = Range(1.001, 1000)
 """Of a search range: from nominal / range_ratio to nominal * range_ratio."""

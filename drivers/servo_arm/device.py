@@ -97,7 +97,7 @@ class ArmDevice:
     @property
     def true_position(self) -> FloatArray:
         """True positions of the joints, (J,) [rad]; never on the wire."""
-        return np.array(self._batch.position[0] - self._batch.bias[0])
+        return np.array(self._batch.true_joints(self._batch.position)[0])
 
     def turn(self, joint: str, position: float | None) -> None:
         """Hold a joint at a position [rad] as by hand, from the next tick on; None lets it go.

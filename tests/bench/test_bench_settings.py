@@ -111,7 +111,7 @@ def test_the_defaults_of_a_bench_are_known_names(name: str) -> None:
     assert settings.beside("runs") == Path(f"{name}_runs")
     module, _, function = settings.work.partition(":")
     cells: Cells = getattr(importlib.import_module(module), function)(settings).cells
-    assert cells.runs and all(len(cell) == len(cells.names) for cell, _ in cells.runs)
+    assert cells.args and all(len(cell) == len(cells.names) for cell, _ in cells.args)
 
 
 def test_the_methods_of_real_are_known() -> None:
@@ -154,4 +154,4 @@ def test_rows_of_an_earlier_version_are_not_run_again(name: str, line: str) -> N
     module, _, function = settings.work.partition(":")
     cells: Cells = getattr(importlib.import_module(module), function)(settings).cells
     done = {tuple(row.get(field, "") for field in cells.names) for row in load_rows(out) if not row["error"]}
-    assert {cell for cell, _ in cells.runs} <= done
+    assert {cell for cell, _ in cells.args} <= done

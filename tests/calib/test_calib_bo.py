@@ -60,6 +60,7 @@ def searched(*, stationary: bool, generations: int, count: int = 3) -> GaussianP
     return search
 
 
+@pytest.mark.slow
 def test_finds_the_top_of_a_hill() -> None:
     """Sixteen points and seven batches of four: within 0.05, where the first points' best is further off."""
     search = searched(stationary=True, generations=8)

@@ -62,6 +62,7 @@ def test_a_right_model_raises_no_alarm(sensed: Case, beginning: Beginning, three
     np.testing.assert_allclose(found.theta, truth, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_friction_that_the_model_lacks_is_not_explained_away(three_unknown: Known) -> None:
     """Start states of their own cannot hide 0.5 N·m of dry friction in each knee."""
     rng = np.random.default_rng(3)

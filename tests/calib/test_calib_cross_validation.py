@@ -10,8 +10,8 @@ import pytest
 from fakes.fixed_search import FixedSearch
 
 from deal_hw.bench.tasks import Case
-from deal_hw.calib.data.problem import Problem, prediction_errors
-from deal_hw.calib.fit.output_error import Recipe, fit_output_error
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.output_error import Recipe, fit_output_error, prediction_errors
 from deal_hw.calib.fit.refinement import Refined, at_parameters
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis

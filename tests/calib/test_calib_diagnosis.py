@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.plain_truth import problem_of, truth
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import Refined, at_parameters, part_of, refine
+from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
+from deal_hw.calib.fit.refinement import part_of, refine
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.diagnosis import Evidence, evidence, find_play, fit_play, name_causes
+from deal_hw.calib.validation.diagnosis import all_allowed, name_causes
+from deal_hw.calib.validation.evidence import Evidence, evidence
+from deal_hw.calib.validation.explain import explained, try_explanations
 from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
 from deal_hw.calib.validation.residual_place import densest_stretch
 from deal_hw.calib.validation.signatures import (
@@ -32,12 +33,8 @@ from deal_hw.calib.validation.signatures import (
     signatures,
 )
 from deal_hw.calib.validation.wider_models import zero_parameters
-from deal_hw.calibration import Budget
-from deal_hw.testing.plain_robots import PLAY, Fault, PlainRobot, make_robot, write
+from deal_hw.testing.plain_robots import make_robot
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import FilesSettings
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
 DAMPING = 2.0
@@ -409,40 +406,16 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
     assert found.std_s == pytest.approx(0.5, rel=0.2)
 
 
-Truth = tuple[PlainRobot, Problem, Refined]
-
-
-def problem_of(robot: PlainRobot, folder: Path) -> Problem:
-    """Return the problem of two recordings of 3 s of a robot."""
-    model, paths, held_out = write(robot, folder, seconds=3.0)
-    work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
-    return Problem(work.robot, work.space, work.episodes, threads=1)
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Fault | None], Truth]:
-    """Return what makes a simulated robot's recordings, and a fit from its own values; each pair once."""
-
-    @functools.cache
-    def make(kind: str, fault: Fault | None) -> Truth:
-        robot = make_robot(kind, 3, fault)
-        problem = problem_of(robot, tmp_path_factory.mktemp("robot"))
-        theta = np.array([robot.truth[name] for name in problem.space.names])
-        return robot, problem, with_rows(refine(problem, theta, robot.delay_s, (0.4,), iterations=4))
-
-    return make
-
-
 @pytest.mark.slow
-def test_a_right_model_has_no_cause(truth: Callable[[str, Fault | None], Truth]) -> None:
+def test_a_right_model_has_no_cause() -> None:
     """Neither a signature, nor a delay, nor play predicts left-out windows better."""
     _, problem, fit = truth("pendulum", None)
     assert name_causes(evidence(problem, fit)) == []
-    assert find_play(problem, fit) is None
+    assert explained(problem, fit, try_explanations(problem, fit, all_allowed)) == []
 
 
 @pytest.mark.slow
-def test_faults_of_a_simulated_robot_are_named(truth: Callable[[str, Fault | None], Truth]) -> None:
+def test_faults_of_a_simulated_robot_are_named() -> None:
     """Stribeck friction, and commands that are late by up to twice the mean delay."""
     _, problem, fit = truth("pendulum", "friction")
     friction = name_causes(evidence(problem, fit))
@@ -466,7 +439,8 @@ def test_a_link_crosses_its_play_as_a_free_body() -> None:
     assert place[70] == pytest.approx(0.01 - 0.02 / 4, abs=3e-4)
 
 
-def test_play_behind_the_motors_encoder_is_named(truth: Callable[[str, Fault | None], Truth]) -> None:
+@pytest.mark.slow
+def test_play_behind_the_motors_encoder_is_named() -> None:
     """1 degree in the elbow, which no set-point's play explains: backlash there, not a heavier link."""
     _, problem, fit = truth("double-pendulum", "motor-play")
     found = name_causes(evidence(problem, fit))
@@ -476,7 +450,7 @@ def test_play_behind_the_motors_encoder_is_named(truth: Callable[[str, Fault | N
 
 
 @pytest.mark.slow
-def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Truth]) -> None:
+def test_a_mass_is_named_with_its_size() -> None:
     """The last link weighs 50 % more."""
     _, problem, fit = truth("double-pendulum", "mass")
     found = name_causes(evidence(problem, fit))
@@ -484,15 +458,6 @@ def test_a_mass_is_named_with_its_size(truth: Callable[[str, Fault | None], Trut
     assert "Weigh" in found[0].do and "heavier" in found[0].seen
     known = uncertainty_at(problem, fit, fixed_latency=False)
     assert known.alarms and with_causes(problem, fit, known, found)[0].alarms[0] == found[0]
-
-
-@pytest.mark.slow
-def test_another_minimum_is_no_play(truth: Callable[[str, Fault | None], Truth]) -> None:
-    """A right model, and a local fit that ended elsewhere: the wider fit finds the truth, without play."""
-    _, problem, fit = truth("pendulum", None)
-    elsewhere = at_parameters(problem, 1.5 * fit.theta, fit.latency_s + 0.008, fit.shooting.length)
-    assert elsewhere.chi2 > 10 * fit.chi2
-    assert find_play(problem, elsewhere) is None
 
 
 def test_half_of_two_recordings_is_a_part(small_problem: Callable[..., Problem]) -> None:
@@ -506,56 +471,6 @@ def test_half_of_two_recordings_is_a_part(small_problem: Callable[..., Problem])
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
     left_out = [~e.usable for e in part_of(problem, total_s / 2).episodes]
     assert sum(map(np.count_nonzero, left_out)) >= 200
-
-
-@pytest.mark.slow
-def test_play_is_found_and_measured(
-    truth: Callable[[str, Fault | None], Truth], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A gear with 0.06 rad of play: refitted with play in it the model predicts the rest to the noise.
-
-    The fit with play is the expensive part: one that is there is taken.
-    """
-    _, problem, fit = truth("pendulum", "backlash")
-    fitted = fit_play(problem)
-    monkeypatch.setattr(diagnosis, "fit_play", lambda _: None)
-    assert find_play(problem, fit) is None
-    assert find_play(dataclasses.replace(problem), fit, fitted) is None
-    found = find_play(problem, fit, fitted)
-    assert found is not None and found.explains
-    cause = found.diagnosis
-    assert cause.code == "backlash" and cause.subject == ("pivot",)
-    assert "0.06 rad at pivot" in cause.seen and "servo_play" in cause.do
-    assert cause.share > diagnosis.DECISIVE
-
-
-@pytest.mark.slow
-def test_play_that_explains_all_becomes_a_parameter(truth: Callable[[str, Fault | None], Truth]) -> None:
-    """No search follows; the result has the play, the true values, and one alarm."""
-    robot, problem, _ = truth("pendulum", "backlash")
-    result = calibrate_episodes(
-        problem.robot,
-        problem.space,
-        problem.episodes,
-        problem.episodes[:1],
-        method="default",
-        budget=Budget(population=8, generations=2),
-        rng=np.random.default_rng(0),
-        threads=1,
-    )
-    assert result.space.names == (*problem.space.names, "pivot.play") and result.steps < 5_000_000
-    assert result.provenance["search"] == "local fit" and result.chi2 < MISMATCH_CHI2
-    true = np.array([robot.truth.get(name, PLAY) for name in result.space.names])
-    np.testing.assert_allclose(result.estimate[-1], PLAY, rtol=0.02)
-    inside = (result.interval[:, 0] <= true) & (true <= result.interval[:, 1])
-    assert inside.mean() >= 0.75
-    (alarm,) = [one for one in result.alarms if "play" in one.seen]
-    assert "it has the play as pivot.play" in alarm.do
-    assert result.heldout_nrmse["calibrated"] < 0.1 * result.heldout_nrmse["nominal"]
-    assert trust(result).colour == "amber"
-    asked = result.restricted(problem.space)
-    assert asked.space.names == problem.space.names and len(asked.verdicts) == len(asked.estimate)
-    np.testing.assert_array_equal(asked.distribution().mean, result.distribution().mean[:-1])
 
 
 @pytest.mark.slow

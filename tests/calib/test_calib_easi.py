@@ -95,6 +95,7 @@ def test_finds_the_top_of_a_hill() -> None:
     np.testing.assert_allclose(search.mean, top, atol=0.01)
 
 
+@pytest.mark.slow
 def test_with_its_critic_it_gets_nearer_than_the_centre(
     recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]
 ) -> None:

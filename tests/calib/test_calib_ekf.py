@@ -113,6 +113,7 @@ def test_restart_keeps_the_parameters_and_forgets_the_rest() -> None:
     np.testing.assert_allclose(kalman.covariance, np.diag([0.01, 4 / 3]), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_latency_is_one_more_state(
     recorded: Callable[..., Recorded], small_problem: Callable[..., Problem]
 ) -> None:

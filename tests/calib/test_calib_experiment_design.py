@@ -236,17 +236,17 @@ def test_optimum_is_at_least_as_good_as_all_candidates(
     rng = np.random.default_rng(5)
     experiment = Experiment(servo, ranges(space("mass", "damping", "effort_limit")), 1.0, 2, rng, threads=1)
     seen = recording(experiment, monkeypatch)
-    settings = SearchSettings(candidates=6, finalists=3, rounds=8, criterion=criterion)  # type: ignore[arg-type]
+    settings = SearchSettings(candidates=4, finalists=2, rounds=4, criterion=criterion)  # type: ignore[arg-type]
     plain = make_plan(servo.description, ExcitationDesign(seconds=1.0, low_hz=1.0))
     found = search_excitation(
         experiment, rng, settings, references={"plain": lambda: ExcitationBehaviour(plain, servo.description)}
     )
-    assert len(seen) == found.tried + 1 == 3 + 6 + 8 + 1
+    assert len(seen) == found.tried + 1 == 3 + 4 + 4 + 1
     # Nothing that was given up on the way would have been better.
     every = [experiment.predict(make) for make in list(seen)[:-1]]
     assert score(found.prediction, settings) == pytest.approx(max(score(p, settings) for p in every))
     assert found.references["plain"].usable
-    assert list(found.trace) == sorted(found.trace) and len(found.trace) == 1 + 8
+    assert list(found.trace) == sorted(found.trace) and len(found.trace) == 1 + 4
     np.testing.assert_allclose(list(found.plan.predicted.values()), found.prediction.std)
     again = experiment.predict(lambda: ExcitationBehaviour(found.plan, servo.description))
     assert again.gain == pytest.approx(found.prediction.gain)

@@ -144,7 +144,12 @@ def test_deal_paper_takes_another_fitness(problem: Problem, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("task", "seconds", "expected"),
-    [("go2", 6.0, 250), ("allegro", 13.0, 600), ("allegro", 4.0, 200), ("ant", 6.0, 200)],
+    [
+        ("go2", 6.0, 250),
+        pytest.param("allegro", 13.0, 600, marks=pytest.mark.slow),
+        ("allegro", 4.0, 200),
+        ("ant", 6.0, 200),
+    ],
 )
 def test_a_rollout_has_the_transitions_of_the_papers_table_4(
     task: str, seconds: float, expected: int

@@ -63,6 +63,7 @@ class TestGaussNewton(MethodSuite):
         )
 
 
+@pytest.mark.slow
 def test_finds_parameters_and_latency_under_noise() -> None:
     """Two parameters within 10 %, the latency within 1 ms, all inside the stated intervals."""
     made = problem(sensor=True)

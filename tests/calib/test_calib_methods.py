@@ -428,7 +428,7 @@ def test_a_method_knows_whether_a_critic_learns_and_whether_it_searches() -> Non
     assert {name for name in METHODS if not make_method(name).moves} == {"nominal"}
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_parts_of_deal_differ_in_what_the_update_sees(noise: float) -> None:
     """Only a trained critic estimates a distance; each part moves the population elsewhere."""
     d = recorded("sensor" if noise else "ideal", 0)

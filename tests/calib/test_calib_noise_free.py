@@ -44,6 +44,7 @@ def seen(beginning: Beginning, three_unknown: Known) -> Seen:
     return Seen(case.robot, space, beginning(case.fit, SECONDS), truth)
 
 
+@pytest.mark.slow
 def test_a_factor_of_eight_off_and_a_step_late_comes_out_exact(seen: Seen) -> None:
     """No search: from eight times the truth and the wrong whole step, all to 1e-6 and the latency right."""
     problem = Problem(seen.robot, seen.space, [seen.episode], threads=1)

@@ -191,11 +191,14 @@ CANDIDATES = {"short", "0.4 s", "0.8 s", "1.2 s", "long", "long, robust", "long,
 
 @pytest.mark.slow
 def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationResult) -> None:
-    """Every candidate has an error in each fold, a fit wins, and the truth lies in the intervals."""
+    """Every candidate has an error in each fold, a fit of the right model wins; the intervals hold the truth.
+
+    Around the fit of short windows a law can be screened as worth a fit. It is not chosen.
+    """
     folds = result.provenance["cross_validation"]
-    assert set(folds["errors"]) == CANDIDATES
+    assert set(folds["errors"]) >= CANDIDATES
     assert all(len(errors) == 2 for errors in folds["errors"].values())
-    assert folds["chosen"] != "long, no latency"
+    assert folds["chosen"] in CANDIDATES - {"long, no latency"} and "law" not in result.provenance
     assert result.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
     assert np.all(result.interval[:, 0] <= TRUTH) and np.all(result.interval[:, 1] >= TRUTH)
     assert result.latency_s == pytest.approx(LATE_S, abs=2e-3)
@@ -220,6 +223,7 @@ def stuck_at_first(problem: Problem) -> Watched:
     return method.run(problem, BUDGET, np.random.default_rng(0), watch), offered
 
 
+@pytest.mark.slow
 def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_start(
     problem: Problem, stuck_at_first: Watched
 ) -> None:
@@ -228,9 +232,9 @@ def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_star
     assert [stage for stage, _ in offered] == ["fit of short windows", "fit of long windows", "search"]
     assert offered[0][1] == problem.space.nominal[0]
     assert offered[1][1] == pytest.approx(TRUTH[0], rel=0.03)
-    assert set(found.provenance["cross_validation"]["errors"]) == (CANDIDATES - {"0.8 s", "1.2 s"}) | {
-        "search"
-    }
+    errors = found.provenance["cross_validation"]["errors"]
+    assert set(errors) >= (CANDIDATES - {"0.8 s", "1.2 s"}) | {"search"} and "0.8 s" not in errors
+    assert "law" not in found.provenance
     assert found.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
 
 

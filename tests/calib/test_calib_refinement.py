@@ -168,6 +168,7 @@ def test_new_start_states_are_tried_before_drawn_points(
         return best if lower else stuck
 
     monkeypatch.setattr(stages, "refined_from", refined)
+    monkeypatch.setattr(stages, "from_start", lambda problem, start, **_: refined(run, *start))
     assert (lower_minimum(run, stuck, RestartSettings(drawn=4)) is best) == lower
     assert len(calls) == fits
 
@@ -276,6 +277,7 @@ def test_a_longer_window_that_is_refused_is_kept_as_such(
     assert "latency_scan" in whole.facts and "latency_scan" not in free.facts
 
 
+@pytest.mark.slow
 def test_a_residual_that_no_drawn_point_lowers_is_the_models(small_problem: Callable[..., Problem]) -> None:
     """With a wrong latency forced on it nothing explains the data: one brief search, and an alarm."""
     problem = small_problem(fixed_latency_s=0.02)
@@ -345,6 +347,24 @@ def test_a_joint_at_rest_has_no_vote() -> None:
     assert white_noise_std([_encoder(10.0, rest_s=60.0)])[0] == pytest.approx(found, rel=0.1)
     # Alone it shows nothing: it has the noise of a coarse encoder.
     assert white_noise_std([held])[0] == HELD_STD
+
+
+def test_a_resampled_recording_keeps_its_rounding() -> None:
+    """A slow servo, 12 bits a turn, on an uneven clock: resampling makes values between its counts."""
+    rng = np.random.default_rng(0)
+    clock = np.cumsum(rng.normal(5.3e-3, 1e-4, 2200))
+    turn, count = np.sin(2 * np.pi * 0.1 * clock), 2 * np.pi / 4096
+    counted = np.round(0.4 * turn / count) * count
+    even = np.arange(clock[0], clock[-1], 5.375e-3)
+    position = np.interp(even, clock, counted)[:, None]
+    rounding = count / np.sqrt(12.0)
+    assert np.min(np.diff(np.unique(position))) < 0.1 * count
+    found = noise_model([position], [np.gradient(position, even, axis=0)])
+    assert 0.99 * rounding < found.position_std[0] < 1.5 * rounding
+    assert white_noise_std([position])[0] >= 0.99 * rounding
+    # A sensor without counts is no finer for it.
+    smooth = (turn + 1e-3 * rng.standard_normal(len(turn)))[:, None]
+    assert white_noise_std([smooth])[0] == pytest.approx(1e-3, rel=0.1)
 
 
 def test_timing_jitter_is_told_from_noise() -> None:

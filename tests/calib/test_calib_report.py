@@ -551,7 +551,7 @@ def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tm
     """Everything is written and read back; without inputs there is no report."""
     robot = load_model(DESCRIPTION)
     files = write_result(tmp_path / "a", robot, gathered.result, gathered)
-    exports = {"actuators.yaml", "urdf.yaml", "values.yaml"}
+    exports = {"actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"}
     numbers = {"result.json", "distribution.json", "trace.npz"}
     assert set(files) == {*numbers, *exports, "report.html", "calibrated.xml"}
     assert all(file.is_file() for file in files.values())

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 
+from deal_hw.calib.report.gather import ReportInputs
+from deal_hw.calib.report.page import compared_fits, render
 from deal_hw.calib.report.verdict import compared, make_story, percent
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -108,3 +111,27 @@ def test_units_and_noise_stand_beside_the_gain() -> None:
 def test_percent_has_two_digits() -> None:
     """Also above 100 %."""
     assert [percent(v) for v in (0.0012345, 0.5, 2.34)] == ["0.12\u00a0%", "50\u00a0%", "234\u00a0%"]
+
+
+def test_the_compared_fits_stand_best_first_with_their_errors() -> None:
+    """By hand: 3 and 12 have the geometric mean 6, twice that of 3 and 3; without folds there is no table."""
+    choice = {
+        "chosen": "long",
+        "errors": {"short": [3.0, 12.0], "long": [3.0, 3.0], "long, <play>": [2.0, 4.0]},
+        "window_s": 2.0,
+    }
+    fits = compared_fits(choice)
+    assert [(fit.name, fit.chosen) for fit in fits] == [
+        ("long, <play>", False),
+        ("long", True),
+        ("short", False),
+    ]
+    assert [fit.ratio for fit in fits] == pytest.approx([8**0.5 / 3, 1.0, 2.0])
+    heldout = {"nominal": 0.1, "calibrated": 0.02}
+    found = result(heldout, provenance={"cross_validation": choice})
+    page = render(ReportInputs(robot="arm", result=found))
+    row = page.split("long, &lt;play&gt;</td>")[1].split("</tr>")[0]
+    assert re.findall(r">([\d.]+)<", row) == ["2", "4", "0.94"]
+    assert page.count("<b>(chosen)</b>") == 1 and '<th class="n">fold 2</th>' in page
+    assert compared_fits({"chosen": "nominal", "note": "too few"}) == []
+    assert "Fits that were compared" not in render(ReportInputs(robot="arm", result=result(heldout)))

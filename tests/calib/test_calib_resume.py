@@ -91,7 +91,7 @@ def whole_of(name: str) -> CalibrationResult:
     return run(method, make_problem(1e-3), budget, None, 0)
 
 
-@pytest.mark.parametrize("stop", [2, 5, 9])
+@pytest.mark.parametrize("stop", [2, pytest.param(5, marks=pytest.mark.slow), 9])
 def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
     """Whatever it was about: the first stage, a later one with moved start states, or a restart."""
     (method, budget), path = STAGED["eki"], tmp_path / "checkpoint.npz"

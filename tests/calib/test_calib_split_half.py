@@ -15,7 +15,7 @@ from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation import diagnosis
+from deal_hw.calib.validation import diagnosis, explain
 from deal_hw.calib.validation.checks import (
     HALVES,
     SplitHalf,
@@ -263,8 +263,8 @@ def test_causes_come_before_halves(
         asked.append(name)
         return False
 
-    for wider in ("fit_play", "fit_wider"):
-        monkeypatch.setattr(diagnosis, wider, lambda *_: pytest.fail("a wider model was fitted"))
+    for module in (diagnosis, explain):
+        monkeypatch.setattr(module, "fit_wider", lambda *_: pytest.fail("a wider model was fitted"))
     wrong = dataclasses.replace(noisy_refined, chi2=5.0)
     known = uncertainty_at(noisy_problem, wrong, fixed_latency=True)
     settings = Validation(physics_step=False)

@@ -173,6 +173,7 @@ def test_an_unknown_entry_is_refused(case: Case) -> None:
         chosen_starts(problem_of(case)[0], None, {"pole.speed": 1.0}, lambda _: None)
 
 
+@pytest.mark.slow
 def test_drawn_states_find_the_truth_although_the_first_state_is_wrong(case: Case, history: int) -> None:
     """Both parameters within 5 %; from the recorded first state neither is within 10 %."""
     problem, theta = problem_of(case, with_wrong_start(case, history))

@@ -354,7 +354,7 @@ def test_parameter_that_no_rollout_sees_is_refused(
             ),
             "floats",
         ),
-        (ARM.replace('kp="12" kv="0.1"', 'kp="12" gear="3"', 1), "gear 3"),
+        (ARM.replace('kp="12" kv="0.1"', 'kp="12" gear="0"', 1), "its gear or gain is 0; write others"),
     ],
 )
 def test_bad_models_are_refused(

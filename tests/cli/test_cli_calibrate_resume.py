@@ -191,7 +191,7 @@ def test_a_worse_fit_does_not_replace_the_best() -> None:
 
 
 FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "report.html"}
-FILES |= {"actuators.yaml", "urdf.yaml", "values.yaml"}
+FILES |= {"actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"}
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.training import TrainingProgress
 from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.emulation.process import EmulatorProcess
+from deal_hw.workflows.emulation.walk_script import HELDOUT, Walk
 from deal_hw.workflows.running import episode
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 from deal_hw.workflows.running.settings import LegOptions
@@ -106,13 +107,13 @@ def test_demo_runs_all_five_jobs_and_leaves_a_summary(
     assert Path(inspect.split()[2]).is_file() and Path(page.removeprefix("python3 -m webbrowser ")).is_file()
 
 
-def walked_in_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the Go2 stand up faster, walk a part of the profile and lie down faster."""
+def walked_in_short(monkeypatch: pytest.MonkeyPatch, task: str = "walk") -> None:
+    """Let the Go2 stand up faster, walk a part of the task's profile and lie down faster."""
     quick = PostureConfig(fold_s=0.5, rise_s=0.8, lie_s=0.8)
     monkeypatch.setattr(demo_go2, "LegOptions", functools.partial(LegOptions, posture=quick))
-    monkeypatch.setattr(demo_go2, "PROFILE", ((0.0, (0.8, 0.0, 0.0)), (2.0, (0.0, 0.4, 0.8))))
-    monkeypatch.setattr(demo_go2, "PROFILE_S", 4.0)
-    monkeypatch.setattr(demo_go2, "HELDOUT_S", 4.0)
+    short = Walk(((0.0, (0.8, 0.0, 0.0)), (2.0, (0.0, 0.4, 0.8))), 4.0), Walk(HELDOUT, 4.0)
+    ahead = Walk(((0.0, (0.7, 0.0, 0.0)), (2.0, (0.5, 0.0, 0.3))), 4.0), Walk(((0.0, (0.5, 0.0, 0.0)),), 4.0)
+    monkeypatch.setattr(demo_go2, "WALKS", {task: short if task == "walk" else ahead})
     # The walk's calibration is judged where it has a test of its own: tests/bench/test_bench_go2_loop.py.
     monkeypatch.setattr(output_error_fits, "GAIT", dataclasses.replace(output_error_fits.GAIT, fitted_s=2.0))
 
@@ -146,6 +147,44 @@ def test_demo_of_the_go2_walks_calibrates_and_walks_again(
     words = " ".join(printed.split())
     assert re.search(f"The policy fine-tuned under the calibration {judged}", words)
     assert "the shipped policy missed the velocity by" in words
+
+
+@pytest.mark.slow
+def test_demo_of_the_go2_climbs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One try of each policy before a low platform, each with the robot at its start; the share is told."""
+    walked_in_short(monkeypatch, "climb")
+    folder = tmp_path / "demo"
+    settings = DEMO.settings(
+        "go2",
+        task="climb",
+        platform=0.04,
+        transport="zenoh",
+        out=folder,
+        profile="sensor",
+        seed=2,
+        episodes=1,
+        steps=4800,
+    )
+    report = demo(settings)
+    assert set(report.summary["climbed"]) == {"udr", "udr more", "calibrated"}
+    assert all(share in (0.0, 1.0) for share in report.summary["climbed"].values())
+    for name in ("udr", "udr_more", "calibrated"):
+        assert list((folder / f"climb_{name}" / "episodes").glob("*.mcap"))
+        assert json.loads((folder / f"truth_climb_{name}_0.json").read_text(encoding="utf-8"))
+    words = " ".join(capsys.readouterr().out.split())
+    assert re.search(
+        r"Onto a platform of 0.04 m: the policy fine-tuned under the calibration [01] of 1", words
+    )
+
+
+def test_only_a_climb_has_a_platform(tmp_path: Path) -> None:
+    """An option without an effect is refused; the folder is named after the task."""
+    with pytest.raises(ConfigurationError, match="only --task climb has a platform"):
+        DEMO.settings("go2", task="canter", platform=0.15)
+    assert DEMO.settings("go2", task="climb", platform=0.15).folder == Path("runs/demo_climb")
+    assert DEMO.settings("go2").folder == Path("runs/demo_go2")
 
 
 def ended(
@@ -249,8 +288,17 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     assert late.episodes[0].outcome is Outcome.TRIPPED  # Five times late: it counts.
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("job", ["collect", "train", "deploy"])
+@pytest.mark.parametrize(
+    ("job", "number"),
+    [
+        ("collect", signal.SIGINT),
+        ("train", signal.SIGTERM),
+        ("deploy", signal.SIGINT),
+        pytest.param("collect", signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param("train", signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param("deploy", signal.SIGTERM, marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_ends_the_demo_in_each_job(
     job: str, number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,6 +54,7 @@ VALUES: dict[str, tuple[str, ...]] = {
     "port": ("p2",),
     "excite": ("multisine",),
     "velocity": ("0.1,0,0",),
+    "obstacle": ("1,0.1",),
     "stop_buttons": ("R2+A",),
     "stand": ("False",),
     "task": ("balance",),

@@ -132,6 +132,8 @@ VALUES: dict[str, tuple[str, ...]] = {
     "low_hz": ("0.5",),
     "margin_s": ("0.01",),
     "method": ("midpoint",),
+    "engine": ("warp-cpu",),
+    "ray": ("local:2",),
     "methods": ("eki",),
     "model": ("arm.xml",),
     "name": ("other",),
@@ -163,11 +165,13 @@ VALUES: dict[str, tuple[str, ...]] = {
     "spike_ratio": ("50",),
     "screenshot": ("b.png",),
     "seeds": ("7",),
+    "setups": ("setups.yaml",),
     "space": ("k11",),
     "start": ("start.safetensors",),
     "start_std": ("shoulder.velocity", "0.1"),
     "steps": ("1000",),
     "task": ("ant",),
+    "terrain": ("box:0.2",),
     "track_to": ("track.csv",),
     "transport": ("can",),
     "trainer": ("ppo",),
@@ -262,6 +266,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert main(line.split()) == 0
         text = "parameters:\n  - {kind: dof_damping, elements: shoulder}\n"
         (folder / "parameters.yaml").write_text(text, encoding="utf-8")
+        text = "setups: {loaded: {recordings: ['more*', 1], payload: {body: upper, mass: 0.1}}}\n"
+        (folder / "setups.yaml").write_text(text, encoding="utf-8")
         distribution = json.dumps(udr_distribution("cartpole").to_json())
         (folder / "distribution.json").write_text(distribution, encoding="utf-8")
         foreign_policy.mjlab_file(folder / "mjlab.onnx", Foreign())

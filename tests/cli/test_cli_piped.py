@@ -179,7 +179,7 @@ def test_bench(lines: Lines, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
         yield {"seed": 1, "error": ""}
 
     made = rows()
-    cells = Cells(names=("seed",), runs=[((seed,), lambda: next(made)) for seed in (0, 1)])
+    cells = Cells(names=("seed",), run=lambda: next(made), args=[((seed,), ()) for seed in (0, 1)])
     table = RowTable(cells=cells, line=str, summary=lambda rows: None)
     monkeypatch.setattr(loop, "table", lambda settings: table)
     assert bench.bench(Loop(out=tmp_path / "rows.json")) == 0

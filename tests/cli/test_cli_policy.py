@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,11 @@ from deal_hw.workflows.shipped import required_policy
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A walk half as long, of half as many robots, shows the same."""
-    monkeypatch.setattr(walking_trial, "SECONDS", 3.0)
-    monkeypatch.setattr(walking_trial, "ROBOTS", 2)
+    """A walk half as long, of one robot for each command, shows the same."""
+    trial = walking_trial.WalkingTrial(seconds=3.0, robots=1)
+    monkeypatch.setattr(
+        walking_trial, "try_walking", functools.partial(walking_trial.try_walking, trial=trial)
+    )
 
 
 @pytest.fixture

@@ -188,14 +188,14 @@ SETTINGS: Lines = [
     (f"{MODEL} one.csv", "actuators of the model without recorded commands: belt"),
     (f"{MODEL} positions.csv", "name them as `target` in the column map"),
     (f"{MODEL} still.csv --force", "record more motion"),
-    ("calibrate --model velocity.xml --data rec.csv", "neither a position servo"),
+    ("calibrate --model velocity.xml --data rec.csv", "some are motors (elbow); calibration takes one kind"),
     ("collect cartpole --port p", "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
     ("collect cartpole --port p --out a --dataset b", "give --out RUN or --dataset DIR, not both"),
     ("collect cartpole --port p --out o --excite long.json", "an excitation of 1e+09 s"),
     ("collect cartpole --port p --out o --transport nosuch", "unknown transport 'nosuch'; known: serial"),
     ("collect ant --port p --out o", "robots that can be driven: cartpole, go2"),
     ("deploy go2 --port p --certificate text.txt", "a certificate and its private key belong together"),
-    ("deploy go2 --port p --velocity 9,0,0", "x is 9.0, allowed: -1 to 1"),
+    ("deploy go2 --port p --velocity 9,0,0", "x is 9.0, allowed: -1.5 to 1.5"),
     ("deploy go2 --port p --stop-buttons X+NOSUCH", "unknown button 'NOSUCH'; known: R1, L1"),
     ("replay run/dataset/episodes/000000.mcap --port p --robot go2", "the recording has joints"),
     (
@@ -403,7 +403,7 @@ def test_a_demo_without_its_policy_says_how_to_make_it(
     refused: Callable[[str, str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A checkout in which the assets were left out."""
-    monkeypatch.setattr(shipped, "shipped_policy", lambda robot: None)
+    monkeypatch.setattr(shipped, "shipped_policy", lambda robot, task="": None)
     refused("demo --out new", "tools/train_udr_policy.py trains one")
 
 

@@ -202,6 +202,7 @@ def test_every_known_quantity_is_built(quantity: Quantity) -> None:
     """And all differ: two that read the same would be a quantity that is taken for another."""
     # Along z the place is the height.
     element = {**dict.fromkeys(BASE, "z"), "clock": "cos", "place": "x", "target_rotation": "y"}
+    element["obstacle"] = "height"
     spec = dataclasses.replace(
         feedback_spec(DRIVER),
         clock_hz=2.5,
@@ -211,7 +212,7 @@ def test_every_known_quantity_is_built(quantity: Quantity) -> None:
         ),
     )
     builder = ObservationBuilder(spec)
-    builder.command = np.array([0.1, 0.2, 0.77])
+    builder.command, builder.obstacle = np.array([0.1, 0.2, 0.77]), np.array([1.1, 0.13])
     builder.record_action(np.full(12, 0.35))
     rng = np.random.default_rng(1)
     built = builder.build(rng.uniform(0.2, 1.0, 18), rng.uniform(0.2, 1.0, 18))

@@ -61,6 +61,22 @@ def play(command: FloatArray, *, servo: bool, seed: int) -> FloatArray:
     return np.asarray(seen + 5e-4 * np.random.default_rng(seed).standard_normal(seen.shape))
 
 
+@pytest.mark.parametrize("gain", [0.15, 0.5])
+def test_a_soft_servo_that_gravity_holds_back_is_no_effort(gain: float) -> None:
+    """It moves less than a half of what was commanded; its friction and weight make it lag, too."""
+    command = 1.5 * np.sin(2 * np.pi * 0.3 * np.arange(0.0, 10.0, 0.02))[:, None] * np.ones(2)
+    x, v, seen = np.zeros(2), np.zeros(2), np.empty_like(command)
+    for k in range(10 * len(command)):
+        if k % 10 == 0:
+            seen[k // 10] = x
+        torque = gain * (command[k // 10] - x) - 0.3 * np.sin(x) - 0.05 * v
+        v = v + STEP_S / 0.005 * torque
+        x = x + STEP_S * v
+    moved = float(np.ptp(seen) / np.ptp(command))
+    assert 0.2 < moved < 0.75
+    assert command_kind(table(seen, command), servo=True).severity is Severity.OK
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_positions(seed: int) -> None:
     """Fine for servos, refused for motors."""

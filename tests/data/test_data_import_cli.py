@@ -223,10 +223,11 @@ def test_page_shows_a_column_map_that_reads() -> None:
         "jaw",
         "cart",
         "wheel",
+        "spindle",
         "finger",
         "knee",
     ]
-    assert columns.joints[7].position == "m3.fb" and columns.velocity == "none"
+    assert columns.joints[8].position == "m3.fb" and columns.velocity == "none"
 
 
 def test_so101_converter(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

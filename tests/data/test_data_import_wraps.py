@@ -202,3 +202,28 @@ def test_a_motors_target_is_an_effort() -> None:
         mapped = parse_column_map(values | {"joints": [entries | {"target_unit": unit}]})
         with pytest.raises(ConfigurationError, match=r"is an effort|slides, but its unit is deg"):
             tables_of([read_memory(arrays, "rec")], mapped, kinds=kind)
+
+
+def test_a_velocity_servos_target_is_a_speed() -> None:
+    """It becomes an effort by the servo's gain: 4 N·m·s/rad; positions and efforts are refused."""
+    t = np.arange(0, 6, 0.02)
+    arrays = {"time": t, "hub_pos": 30 * np.sin(t), "hub_cmd": 30 * np.cos(t)}
+    kinds = JointKinds(speeds={"hub": 4.0})
+
+    def read(kinds: JointKinds | None, **entries: object) -> Table:
+        joint = {"name": "hub", "unit": "deg", "offset": 0.1, "sign": -1, **entries}
+        values = {"time": "time", "position": "{joint}_pos", "target": "{joint}_cmd", "joints": [joint]}
+        return tables_of([read_memory(arrays, "rec")], parse_column_map(values), kinds=kinds)[0]
+
+    np.testing.assert_allclose(read(kinds).target[:, 0], -120 * np.cos(t))
+    in_degrees = read(kinds, target_unit="deg/s").target[:, 0]
+    np.testing.assert_allclose(in_degrees, -4 * np.pi / 6 * np.cos(t))
+    shares = read(kinds, target_normalised={"from": [-30, 30], "to": [-2, 2]}).target[:, 0]
+    np.testing.assert_allclose(shares, -8 * np.cos(t))
+    for unit in ("deg", "Nm"):
+        with pytest.raises(ConfigurationError, match="its target is a speed; write target_unit: rad/s"):
+            read(kinds, target_unit=unit)
+    with pytest.raises(ConfigurationError, match="is a speed, but no velocity servo"):
+        read(JointKinds(motors={"hub": 4.0}), target_unit="rad/s")
+    with pytest.raises(ConfigurationError, match="is a speed, but no velocity servo"):
+        read(None, target_unit="rad/s")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -213,7 +214,9 @@ def test_stop_damps_through_the_bridge_and_fights_nobody(
         reported = rig.commands()
         for name in ("observer", "controller"):
             found = stop(name)
-            assert not found.passive and "another controller commands the robot" in found.words
+            # On a busy computer commands arrive before the bridge's status, and the words are of a program.
+            assert not found.passive
+            assert re.search("another (controller|program) commands the robot", found.words)
         assert client.in_charge and rig.commands() == reported
 
 

@@ -91,9 +91,21 @@ print(json.dumps({"made": made, "opened": loaded()}))
 """Makes all that collect, deploy and doctor make of a Go2, opens the path to it, tells what was loaded."""
 
 
+@pytest.fixture
+def silent() -> Iterator[str]:
+    """Return a serial port at which no robot answers."""
+    ours, theirs = os.openpty()
+    yield os.ttyname(theirs)
+    os.close(ours)
+    os.close(theirs)
+
+
 @pytest.fixture(scope="module")
 def port() -> Iterator[str]:
-    """Emulate the nominal cart-pole in a process of its own, which has all extras, and return its port."""
+    """Emulate the nominal cart-pole in a process of its own, which has all extras, and return its port.
+
+    It computes in real time as long as it lives, so the tests that need it are the last of this file.
+    """
     command = [sys.executable, "-m", "deal_hw", "emulate", "cartpole", "--profile", "ideal", "--nominal"]
     with subprocess.Popen(
         [*command, "--parent", str(os.getpid())], stdout=subprocess.PIPE, text=True
@@ -152,6 +164,82 @@ def test_extras_are_really_refused(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        ("deploy cartpole --port PORT --policy POLICY", "deploy"),
+        ("deploy cartpole --port PORT", "deploy"),
+        ("collect cartpole --port PORT --seconds 4 --out run", "deploy"),
+        ("collect cartpole --transport can --port slcan:PORT --motion hold --out run", "can"),
+        ("collect cartpole --transport odrive --port virtual:bus --motion hold --out run", "can"),
+        ("collect cartpole --transport dynamixel --port PORT --motion hold --out run", "dynamixel"),
+        ("collect go2 --transport zenoh --port tcp/127.0.0.1:1 --motion hold --out run", "zenoh"),
+        ("deploy go2 --transport zenoh --port tcp/127.0.0.1:1", "deploy"),
+    ],
+)
+def test_the_base_install_names_the_extra_that_is_missing(
+    tmp_path: Path, silent: str, policy: Path, words: str, extra: str
+) -> None:
+    """One line that says what to install; no robot was moved, and no network is called broken."""
+    line = words.replace("PORT", silent).replace("POLICY", str(policy)).split()
+    done = run_bare(tmp_path, *line, refused=EXTRAS + OF_ROBOT)
+    assert done.returncode == 2, done.stderr
+    assert install_line(extra) in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("transport", "port", "own"),
+    [("zenoh", "tcp/127.0.0.1:0", "zenoh"), ("dds", "lo", "cyclonedds")],
+)
+def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, port: str, own: str) -> None:
+    """Neither torch, mujoco nor scipy; of the two networks the one that was asked for, when it is opened."""
+    if importlib.util.find_spec(own) is None:
+        pytest.skip(f"{own} is not installed")
+    done = subprocess.run(
+        [sys.executable, "-c", REACH_GO2, transport, free_port(port), "97"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    reported = json.loads(done.stdout)
+    networks = {"zenoh", "cyclonedds"}
+    heavy = set(EXTRAS) - networks
+    assert not set(reported["made"]) & (heavy | networks)
+    assert not set(reported["opened"]) & heavy
+    assert set(reported["opened"]) & networks == {own}
+
+
+@pytest.mark.slow
+def test_go2_runs_without_extras(tmp_path: Path) -> None:
+    """Collect and doctor reach a Go2 over Zenoh with `deal-hw[robot]`: all processes of a run included."""
+    options = ("--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--profile", "ideal", "--nominal")
+    posture = ("--fold-s", "0.3", "--rise-s", "0.6", "--lie-s", "0.6")
+    with EmulatorProcess("go2", *options) as emulator:
+        reach = ("go2", "--transport", "zenoh", "--port", emulator.port)
+        done = run_bare(
+            tmp_path, "collect", *reach, "--motion", "hold", "--seconds", "0.4", "--out", "run", *posture
+        )
+        assert done.returncode in {FINISHED, TRIPPED}, done.stderr
+        reported = run_bare(tmp_path, "doctor", *reach, "--seconds", "1")
+    assert "refused" not in done.stderr + reported.stdout + reported.stderr
+    assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
+    assert reported.returncode in {0, 1}, reported.stderr
+    assert "Traceback" not in reported.stderr
+    assert "the body leans by" in reported.stdout
+
+
+def test_dds_without_its_package_names_the_extra(tmp_path: Path) -> None:
+    """One line that says what to install; no process was started for it."""
+    done = run_bare(tmp_path, "collect", "go2", "--port", "lo", "--motion", "hold", "--out", "run")
+    assert done.returncode == 2
+    assert install_line("dds") in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_collect_runs_without_extras(tmp_path: Path, port: str) -> None:
     """Supervisor, control process and recorder record an episode that `data` then reads."""
     done = run_bare(
@@ -192,31 +280,6 @@ def test_the_base_install_records_checks_and_converts(tmp_path: Path, port: str)
     assert "states a second" in examined.stdout, examined.stdout + examined.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "extra"),
-    [
-        ("deploy cartpole --port PORT --policy POLICY", "deploy"),
-        ("deploy cartpole --port PORT", "deploy"),
-        ("collect cartpole --port PORT --seconds 4 --out run", "deploy"),
-        ("collect cartpole --transport can --port slcan:PORT --motion hold --out run", "can"),
-        ("collect cartpole --transport odrive --port virtual:bus --motion hold --out run", "can"),
-        ("collect cartpole --transport dynamixel --port PORT --motion hold --out run", "dynamixel"),
-        ("collect go2 --transport zenoh --port tcp/127.0.0.1:1 --motion hold --out run", "zenoh"),
-        ("deploy go2 --transport zenoh --port tcp/127.0.0.1:1", "deploy"),
-    ],
-)
-def test_the_base_install_names_the_extra_that_is_missing(
-    tmp_path: Path, port: str, policy: Path, words: str, extra: str
-) -> None:
-    """One line that says what to install; no robot was moved, and no network is called broken."""
-    line = words.replace("PORT", port).replace("POLICY", str(policy)).split()
-    done = run_bare(tmp_path, *line, refused=EXTRAS + OF_ROBOT)
-    assert done.returncode == 2, done.stderr
-    assert install_line(extra) in done.stderr
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").exists()
-
-
 def test_deploy_runs_without_extras(tmp_path: Path, port: str, policy: Path) -> None:
     """An ONNX policy runs and is recorded, and its recording replays."""
     robot = ("--port", port, "--out", "run")
@@ -225,53 +288,3 @@ def test_deploy_runs_without_extras(tmp_path: Path, port: str, policy: Path) -> 
     again = run_bare(tmp_path, "replay", "run/dataset/episodes/000000.mcap", *robot)
     assert again.returncode in {FINISHED, TRIPPED}, again.stderr
     assert (tmp_path / "run" / "dataset" / "episodes" / "000001.mcap").stat().st_size > 0
-
-
-@pytest.mark.parametrize(
-    ("transport", "port", "own"),
-    [("zenoh", "tcp/127.0.0.1:0", "zenoh"), ("dds", "lo", "cyclonedds")],
-)
-def test_a_go2_loads_its_own_transport_alone(tmp_path: Path, transport: str, port: str, own: str) -> None:
-    """Neither torch, mujoco nor scipy; of the two networks the one that was asked for, when it is opened."""
-    if importlib.util.find_spec(own) is None:
-        pytest.skip(f"{own} is not installed")
-    done = subprocess.run(
-        [sys.executable, "-c", REACH_GO2, transport, free_port(port), "97"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    reported = json.loads(done.stdout)
-    networks = {"zenoh", "cyclonedds"}
-    heavy = set(EXTRAS) - networks
-    assert not set(reported["made"]) & (heavy | networks)
-    assert not set(reported["opened"]) & heavy
-    assert set(reported["opened"]) & networks == {own}
-
-
-def test_go2_runs_without_extras(tmp_path: Path) -> None:
-    """Collect and doctor reach a Go2 over Zenoh with `deal-hw[robot]`: all processes of a run included."""
-    options = ("--transport", "zenoh", "--port", "tcp/127.0.0.1:0", "--profile", "ideal", "--nominal")
-    posture = ("--fold-s", "0.3", "--rise-s", "0.6", "--lie-s", "0.6")
-    with EmulatorProcess("go2", *options) as emulator:
-        reach = ("go2", "--transport", "zenoh", "--port", emulator.port)
-        done = run_bare(
-            tmp_path, "collect", *reach, "--motion", "hold", "--seconds", "0.4", "--out", "run", *posture
-        )
-        assert done.returncode in {FINISHED, TRIPPED}, done.stderr
-        reported = run_bare(tmp_path, "doctor", *reach, "--seconds", "1")
-    assert "refused" not in done.stderr + reported.stdout + reported.stderr
-    assert (tmp_path / "run" / "dataset" / "episodes" / "000000.mcap").stat().st_size > 0
-    assert reported.returncode in {0, 1}, reported.stderr
-    assert "Traceback" not in reported.stderr
-    assert "the body leans by" in reported.stdout
-
-
-def test_dds_without_its_package_names_the_extra(tmp_path: Path) -> None:
-    """One line that says what to install; no process was started for it."""
-    done = run_bare(tmp_path, "collect", "go2", "--port", "lo", "--motion", "hold", "--out", "run")
-    assert done.returncode == 2
-    assert install_line("dds") in done.stderr
-    assert "Traceback" not in done.stderr

@@ -11,7 +11,8 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps, reported
 from deal_hw.sim.engine.model import load_model
-from deal_hw.sim.engine.servo import delay, slew
+from deal_hw.sim.laws.commands import CommandLaws
+from deal_hw.sim.laws.setpoints import delay, slew
 from deal_hw.types import FloatArray
 
 PERIODS, STEPS = 4, 5
@@ -24,7 +25,7 @@ class Sent:
     def __init__(self, count: int) -> None:
         self._batch = ServoBatch(ROBOT, SPACE, count, threads=1)
         self.robot, self.count, self.lag_s = ROBOT, count, self._batch.lag_s
-        self.play: FloatArray | None = None
+        self.commands = CommandLaws()
         self.path: list[FloatArray] = []
 
     def advance(self, setpoint: FloatArray, every: int = 0) -> tuple[FloatArray, FloatArray]:
@@ -66,7 +67,7 @@ def test_setpoints_are_those_of_the_whole_path_slewed_and_then_delayed(
 def test_play_goes_on_from_period_to_period() -> None:
     """A play of 0.4 around targets of 1 and then 0.9: 0.8 comes out of the first, and stays."""
     sent = Sent(1)
-    sent.play = np.full((1, 1), 0.4)
+    sent.commands = CommandLaws(play=np.full((1, 1), 0.4))
     loop = ClosedLoop(sent, STEPS, whole=True)  # type: ignore[arg-type]
     loop.restart(np.zeros((1, 1)), np.zeros(1))
     for target in (1.0, 0.9, 0.5):

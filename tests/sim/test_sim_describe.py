@@ -124,7 +124,7 @@ def test_motors_are_known_and_mixtures_refused(tmp_path: Path) -> None:
     [
         (('kp="300" kv="4"', 'kp="300" dyntype="integrator"'), None),
         (('<position name="first"', '<velocity name="first" kv="2"/><position name="first"'), None),
-        (('kp="10" kv="0.5"', 'kp="10" gear="2"'), "gear 2, .*forcerange times the gear"),
+        (('kp="10" kv="0.5"', 'kp="10" gear="0"'), "'first' moves nothing, its gear or gain is 0"),
         (('<joint name="rail"', '<joint name="extra" axis="1 0 0"/><joint name="rail"'), "extra"),
     ],
 )
@@ -182,6 +182,13 @@ def test_gravity_tells_a_gain_and_its_sign(tmp_path: Path) -> None:
     assert found.load[1] == pytest.approx(0.0, abs=1e-9)
     mirrored = gravity_gain(robot, [hold(robot, (0.1, 0.0), (0.0, 0.0))])
     assert mirrored is not None and mirrored.gain[0] < 0
+    # An actuator that carries .5 N·m by itself needs .481 N·m of the servo.
+    text = ARM.replace(
+        '<position name="first" joint="lift" kp="10" kv="0.5"',
+        '<general name="first" joint="lift" gainprm="10" biastype="affine" biasprm="-.5 -10 -.5"',
+    )
+    helped = gravity_gain(robot_of(tmp_path, text), [hold(robot, (-0.0481, 0.0), (0.0, 0.0))])
+    assert helped is not None and helped.gain[0] == pytest.approx(10.0, rel=1e-6)
 
 
 def test_an_actuator_that_drives_no_joint_is_named_as_such(tmp_path: Path) -> None:

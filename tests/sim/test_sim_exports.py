@@ -16,6 +16,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.mjcf.bam import bam_parameters
 from deal_hw.sim.mjcf.calibrated import WITHOUT_VALUE_TEXT, write_calibrated_mjcf
 from deal_hw.sim.mjcf.exports import actuator_tables, plain_values, urdf_values, write_exports
 
@@ -108,11 +109,11 @@ def result() -> CalibrationResult:
 
 
 def test_actuator_table_by_hand(robot: RobotModel, result: CalibrationResult) -> None:
-    """Gears are squared in gains and once in limits; delays are whole steps that hold the interval."""
+    """Gears are squared in gains and once in limits; parameters are the joint's; delays are whole steps."""
     table = actuator_tables(robot, result)
     isaac = table["isaac_lab"]
-    # kp 20 * 3^2; kv 1 * 3^2 and the joint's own 0.2; 4 * 3; motor: 5 * 2.
-    assert isaac["stiffness"] == {"shoulder": 180.0}
+    # kp 20; kv 1 * 3^2 and the joint's own 0.2; 4 * 3; motor: 5 * 2.
+    assert isaac["stiffness"] == {"shoulder": pytest.approx(20.0)}
     assert isaac["damping"] == {"shoulder": pytest.approx(9.2)}
     assert isaac["armature"]["shoulder"] == pytest.approx(0.03)
     assert isaac["friction"] == {"shoulder": 0.1, "elbow": 0.0}
@@ -181,10 +182,9 @@ def test_plain_values_have_none_where_there_is_none(result: CalibrationResult) -
 def test_files_are_yaml(robot: RobotModel, result: CalibrationResult, tmp_path: Path) -> None:
     """What is written reads back with any YAML reader, numbers as numbers."""
     names = write_exports(tmp_path, robot, result)
-    assert names == ["actuators.yaml", "urdf.yaml", "values.yaml"]
-    for name, wanted in zip(
-        names, (actuator_tables(robot, result), urdf_values(robot, result), plain_values(result)), strict=True
-    ):
+    assert names == ["actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"]
+    tables = (actuator_tables(robot, result), urdf_values(robot, result), plain_values(result))
+    for name, wanted in zip(names, (*tables, bam_parameters(robot, result)), strict=True):
         found = yaml.safe_load((tmp_path / name).read_text(encoding="utf-8"))
         assert found == wanted | {"alarms": [], "biased": {}}
 
@@ -203,7 +203,7 @@ def test_verdict_alarms_and_biased_values_stand_in_each_file(
         assert found["verdict"] == "amber" and found["verdict_reason"] == "because"
         assert found["alarms"] == ["0.25 kg at the tip."]
         assert found["biased"] == {"shoulder.stiffness": "mass", "latency": "mass"}
-    assert found["parameters"]["shoulder.stiffness"]["biased_by"] == "mass"
+    assert plain_values(doubtful)["parameters"]["shoulder.stiffness"]["biased_by"] == "mass"
     path = tmp_path / "calibrated.xml"
     write_calibrated_mjcf(
         robot, result.space, result.estimate, path, 0.01, verdict="amber", biased=doubtful.biased

@@ -103,12 +103,14 @@ def test_states_go_in_and_come_out_unchanged(robot: RobotModel, space: Parameter
     np.testing.assert_array_equal(batch.velocity, velocity)
 
 
+@pytest.mark.parametrize("at_once", [1, 3])
 def test_windows_of_the_truth_repeat_the_recording(
-    robot: RobotModel, space: ParameterSpace, theta: FloatArray
+    robot: RobotModel, space: ParameterSpace, theta: FloatArray, at_once: int
 ) -> None:
     """Restarted at reported states, the truth predicts an exact recording to rounding, contacts and all."""
     episode = record(robot, space, theta, None).episode
     batch = ServoBatch(robot, space, 1, threads=1)
+    vars(batch.engine)["windows"] = at_once
     batch.set_parameters(theta[None])
     windows = cut_windows(episode, 10)
     path = setpoints(batch, episode, np.array([0.010]))

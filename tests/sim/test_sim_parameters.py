@@ -77,7 +77,7 @@ def test_every_parameter_can_be_seen(name: str) -> None:
     theta = np.repeat(space.nominal[None], 2, axis=0)
     theta[1, space.names.index(name)] *= 2
     batch.set_parameters(theta)
-    from deal_hw.sim.engine.servo import slew
+    from deal_hw.sim.laws.setpoints import slew
 
     target = np.where(np.arange(800) % 400 < 200, 0.25, -0.25)[:, None]
     rate = batch.servo_factor("servo_speed_limit")[:, None] * np.full((1, 800, 1), 4e-3)

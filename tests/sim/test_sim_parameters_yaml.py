@@ -78,7 +78,10 @@ def test_linear_kinds_get_their_usual_width() -> None:
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ("kind: dof_dampin, elements: '*'", r"known: .*dof_frictionloss.*; did you mean 'dof_damping'\?"),
+        (
+            "kind: dof_dampin, elements: '*'",
+            r"nearest of .*.*dof_frictionloss.*; did you mean 'dof_damping'\?",
+        ),
         ("kind: dof_damping, elements: FL_hip", r"known: .*FL_hip_joint.*; did you mean 'FL_hip_joint'\?"),
         ("kind: dof_damping, elements: 'X*'", "unknown MuJoCo joint 'X\\*'"),
         ("kind: dof_damping, elements: []", "must be a joint name, a pattern"),

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.sim.engine.servo import delay, play, slew
+from deal_hw.sim.laws.setpoints import delay, play, slew
 
 
 def test_slew_by_hand() -> None:

@@ -70,10 +70,10 @@ def test_a_can_interface_becomes_an_adapter() -> None:
     assert b"S6\r" in received
 
 
-def test_keys_are_pressed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_keys_are_pressed_when_they_are_asked_for(tmp_path: Path) -> None:
     """In a terminal, in order, each once; the output and the exit code come back."""
-    monkeypatch.setattr(check_clients, "_HESITATION_S", 0.0)
-    client = Client(name="asks", source="", command=(), emulator=(), keys=(("Key?", "a\n"), ("Key?", "b\n")))
+    keys = (("Key?", "a\n"), ("Key?", "b\n"))
+    client = Client(name="asks", source="", command=(), emulator=(), keys=keys, hesitation_s=0.0)
     code = "import sys; print(sys.stdin.isatty(), input('Key?'), input('Key?')); sys.exit(3)"
     output, exit_code = run_in_terminal([sys.executable, "-c", code], client, tmp_path, os.environ)
     assert exit_code == 3

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import measure_size
 import mujoco
 import numpy as np
 import pytest
@@ -82,11 +81,8 @@ def test_a_stopped_calibration_is_said() -> None:
 
 
 @pytest.mark.slow
-def test_a_tiny_arm_is_calibrated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_tiny_arm_is_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One joint, 6 s: seconds, memory and held-out error are in the row, and the profile is shown."""
-    monkeypatch.setattr(measure_size, "SHOWN_FUNCTIONS", 3)
     out, profile = tmp_path / "size.json", tmp_path / "size.prof"
     options = "--threads 1 --no-report --no-advise --population 8 --generations 2"
     arguments = ["--joints", "1", "--seconds", "6", "--options", options, "--profile", str(profile)]

@@ -241,3 +241,30 @@ def test_importing_the_package_loads_nothing() -> None:
     assert reported.startswith("[] ") and "'calibrate'" in reported
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         deal_hw.calibrat  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("engine", "words"),
+    [
+        ("auto", "mujoco simulates the search: --engine auto simulates the populations of --search deal"),
+        ("warp", "the method nominal does not have; leave it out"),
+    ],
+)
+def test_an_engine_is_chosen_before_the_run(
+    pendulum: tuple[Path, Path, Path], capsys: pytest.CaptureFixture[str], engine: Any, words: str
+) -> None:
+    """A method without a search: auto says that MuJoCo does it, and a wish for a GPU is refused."""
+    model, fit, other = pendulum
+    said: list[str] = []
+
+    def run() -> None:
+        deal_hw.calibrate(
+            model, arrays_of(fit), holdout=arrays_of(other), method="nominal", engine=engine, say=said.append
+        )
+
+    if engine == "warp":
+        with pytest.raises(ConfigurationError, match=words):
+            run()
+    else:
+        run()
+        assert any(words in line for line in said)

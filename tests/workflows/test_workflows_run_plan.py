@@ -56,6 +56,8 @@ FULL = RunPlan(
     record_wire=False,
     realtime=False,
     passive_timeout_s=12.0,
+    hold_heading=True,
+    obstacle="1.0,0.15",
 )
 
 

@@ -36,6 +36,8 @@ class Client:
             SO-101's robot.yaml and LeRobot's calibration of it; "homed", that of the emulated SO-101.
         servo_rate: Baud rate of the servos.
         keys: Pairs: what is printed, and the keys to press then; each once, in this order.
+        hesitation_s: Time before a key is pressed [s]: a program sets the terminal up after its prompt, and
+            forgets earlier keys.
         must: Regular expressions that its output must contain.
         must_not: Texts that its output must not contain.
         stop_after_s: An endless program is stopped by Ctrl-C this long after its first output [s].
@@ -55,6 +57,7 @@ class Client:
     files: tuple[Literal["endpoints", "config", "so101", "homed"], ...] = ()
     servo_rate: int = 57_600
     keys: tuple[tuple[str, str], ...] = ()
+    hesitation_s: float = 0.5
     must: tuple[str, ...] = ()
     must_not: tuple[str, ...] = NO_ERROR
     stop_after_s: float = 0.0

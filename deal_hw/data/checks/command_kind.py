@@ -27,6 +27,9 @@ PERHAPS: Final = 0.7
 PERHAPS_SLOPE: Final = (0.4, 2.0)
 """A joint that follows its command with this correlation may be a poor servo; its commands do not count as
 efforts."""
+SOFT_SLOPE: Final = 0.2
+"""A joint that follows closely, but moves less than commanded, is that of a soft servo under a load. A
+Dynamixel XL330 with a P gain of 100 moves a weight of 0.5 N·m by 0.25 to 0.4 of its command."""
 SERVO_SHARE: Final = 0.5
 """In a servo's command its own position has weight 1, within this tolerance."""
 EXPLAINED: Final = 0.5
@@ -125,6 +128,8 @@ def _is_position(position: FloatArray, command: FloatArray, period_s: float) -> 
 def _is_effort(position: FloatArray, command: FloatArray, period_s: float) -> bool:
     correlation, slope, near = _following(position, command, period_s)
     if correlation > PERHAPS and PERHAPS_SLOPE[0] < slope < PERHAPS_SLOPE[1] and near:
+        return False
+    if correlation > FOLLOWS and SOFT_SLOPE < slope < 1:
         return False
     if correlation > FOLLOWS and _in_another_unit(slope):
         # The check of the units names it; efforts would be a second, wrong cause.

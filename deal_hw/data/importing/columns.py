@@ -35,6 +35,8 @@ POSITION_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180, "m": 1.
 """Unit of position -> radians or metres."""
 EFFORT_UNITS: Mapping[str, float] = {"N": 1.0, "Nm": 1.0}
 """Unit of a motor's target -> newtons or newton metres."""
+SPEED_UNITS: Mapping[str, float] = {f"{unit}/s": factor for unit, factor in POSITION_UNITS.items()}
+"""Unit of a velocity servo's target -> radians or metres a second."""
 QUATERNION_ORDERS = ("wxyz", "xyzw")
 FRAMES = ("world", "base")
 
@@ -92,8 +94,8 @@ class JointColumns:
         index: Its column in arrays with one column per joint; None: by label, else by its place in the list.
         position, target, velocity, effort: Channels; None: by the map's pattern.
         unit: Unit of position and target, one of :data:`POSITION_UNITS`.
-        target_unit: Unit of the target if it differs, also one of :data:`EFFORT_UNITS`; "" for the same, or
-            for an effort if a motor drives the joint.
+        target_unit: Unit of the target if it differs, also one of :data:`EFFORT_UNITS` or, for a velocity
+            servo, of :data:`SPEED_UNITS`; "" for the same, or for what the joint's actuator takes, in SI.
         normalised: Replaces ``unit`` if the file's values have none.
         target_normalised: The same for the target if it differs.
         sign: 1 or -1.
@@ -101,6 +103,9 @@ class JointColumns:
         slides: The joint's unit is m; only needed with ``normalised``, and without a model.
         motor: Effort of the motor that drives the joint in the model, at its highest command [N or N·m];
             None: no motor, or no model. No entry of a file.
+        speed_gain: Effort an error of the speed, of the velocity servo that drives the joint in the model
+            [N·s/m or N·m·s/rad]: its target, a speed, becomes an effort by it. None: there is none. No entry
+            of a file.
     """
 
     name: str
@@ -118,14 +123,22 @@ class JointColumns:
     offset: float = 0.0
     slides: bool = False
     motor: float | None = None
+    speed_gain: float | None = None
 
     def __post_init__(self) -> None:
         if self.unit not in POSITION_UNITS:
             raise UnknownNameError("unit of position", self.unit, POSITION_UNITS)
-        if self.target_unit and self.target_unit not in (units := {**POSITION_UNITS, **EFFORT_UNITS}):
+        units = {**POSITION_UNITS, **EFFORT_UNITS, **SPEED_UNITS}
+        if self.target_unit and self.target_unit not in units:
             raise UnknownNameError("unit of a target", self.target_unit, units)
         if self.slides and self.unit == "deg":
             raise ConfigurationError(f"joint {self.name!r} slides, but its unit is deg; write m or mm")
+        if self.speed_gain is not None and (self.target_unit or "rad/s") not in SPEED_UNITS:
+            raise ConfigurationError(
+                f"joint {self.name!r}: target_unit {self.target_unit}, but a velocity servo of the model "
+                f"drives it, so its target is a speed; write target_unit: {self.si_unit}/s, or give the "
+                "model a <position> or a <motor>"
+            )
         if self.motor is not None and POSITION_UNITS.get(self.target_unit, 1.0) != 1.0:
             raise ConfigurationError(
                 f"joint {self.name!r}: target_unit {self.target_unit}, but a motor of the model drives it, "
@@ -151,7 +164,7 @@ class JointColumns:
     @property
     def takes_effort(self) -> bool:
         """Whether the target is an effort, not a position."""
-        return self.motor is not None or self.target_unit in EFFORT_UNITS
+        return not (self.motor is None and self.speed_gain is None) or self.target_unit in EFFORT_UNITS
 
     @property
     def unit_unsaid(self) -> bool:
@@ -160,11 +173,21 @@ class JointColumns:
 
     def scale(self, target: bool = False) -> tuple[float, float]:
         """Return slope and constant of the conversion from a file's value to rad or m, or N or N·m."""
+        if target and self.speed_gain is None and self.target_unit in SPEED_UNITS:
+            raise ConfigurationError(
+                f"joint {self.name!r}: target_unit {self.target_unit} is a speed, but no velocity servo of a "
+                "model drives it; name the column of commanded positions or efforts, or give the model a "
+                "<velocity>"
+            )
+        if target and self.speed_gain is not None and self.target_normalised is None:
+            unit = SPEED_UNITS[self.target_unit] if self.target_unit else 1.0
+            return self.sign * unit * self.speed_gain, 0.0
         if target and self.takes_effort:
             scale = self.target_normalised
             slope = 1.0 if scale is None else scale.slope
             constant = 0.0 if scale is None else scale.robot[0] - slope * scale.file[0]
-            return self.sign * slope, self.sign * constant
+            sign = self.sign * (1.0 if self.speed_gain is None else self.speed_gain)
+            return sign * slope, sign * constant
         both = self.target_normalised if target and self.target_normalised else self.normalised
         if both is not None and not (target and self.target_unit and not self.target_normalised):
             slope = both.slope
@@ -206,10 +229,13 @@ class JointKinds:
     Attributes:
         slides: Those that slide; the others turn.
         motors: Those driven by a motor, each with its effort at its highest command [N or N·m].
+        speeds: Those driven by a velocity servo, each with its effort an error of the speed [N·s/m or
+            N·m·s/rad].
     """
 
     slides: frozenset[str] = frozenset()
     motors: Mapping[str, float] = field(default_factory=dict)
+    speeds: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -253,7 +279,7 @@ class ColumnMap:
             )
 
     def for_model(self, kinds: JointKinds) -> ColumnMap:
-        """Return the map with what a model says of its joints: which slide, and which have motors.
+        """Return the map with what a model says of its joints: which slide, and what their actuators take.
 
         Raises:
             ConfigurationError: A joint that slides has angles, or a motor's target is a position.
@@ -262,8 +288,9 @@ class ColumnMap:
         for joint in self.joints:
             slides = joint.name in kinds.slides or joint.slides
             unit = "m" if slides and joint.unit == "rad" else joint.unit
+            motor, speed_gain = kinds.motors.get(joint.name), kinds.speeds.get(joint.name)
             joints.append(
-                dataclasses.replace(joint, slides=slides, unit=unit, motor=kinds.motors.get(joint.name))
+                dataclasses.replace(joint, slides=slides, unit=unit, motor=motor, speed_gain=speed_gain)
             )
         return dataclasses.replace(self, joints=tuple(joints))
 
@@ -337,7 +364,7 @@ _CHANNELS = ("position", "target", "velocity", "effort")
 def _joint(entry: Any, defaults: Mapping[str, str]) -> JointColumns:
     if isinstance(entry, (str, int)):
         entry = {"name": str(entry)}
-    values = _mapping("joint", entry, {field.name for field in fields(JointColumns)} - {"motor"})
+    values = _mapping("joint", entry, {f.name for f in fields(JointColumns)} - {"motor", "speed_gain"})
     if "name" not in values:
         raise ConfigurationError(f"joint {shown(values)} has no name; give its name in the model")
     name = str(_text("name of a joint", values["name"]))

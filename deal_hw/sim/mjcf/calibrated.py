@@ -6,7 +6,7 @@ Only attributes with a changed value are edited; see :mod:`deal_hw.sim.mjcf.text
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ from deal_hw.sim.mjcf.changes import MjcfChanges, differences, numbers
 from deal_hw.sim.mjcf.paths import Relocation
 from deal_hw.sim.mjcf.text import Element, SourceFile, read_files
 from deal_hw.sim.parameters import DEVICE_KINDS, check_kinds
+from deal_hw.sim.parameters.drive import filtered
+from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray
 
 SPEED_LIMIT_NUMERIC = "deal_hw.speed_limit"
@@ -83,11 +85,13 @@ def write_calibrated_mjcf(
         *(f"no value: {name}; {values[name]:.5g} {space[name].unit} stands here" for name in without_value),
         *(f"biased by {cause}: {name}" for name, cause in biased.items()),
     ]
+    model = model_with(robot, space, theta)
+    lags = _write_lags(model, space, theta)
     return change_mjcf(
         robot.description.mjcf,
         path,
-        model_with(robot, space, theta),
-        device_values(space, theta) | {LATENCY_NUMERIC: ([latency_s], [])},
+        model,
+        device_values(space, theta, lags) | {LATENCY_NUMERIC: ([latency_s], [])},
         source,
         # A file that was calibrated before may have a list: it is replaced, also by "none".
         {
@@ -99,14 +103,40 @@ def write_calibrated_mjcf(
     )
 
 
-def device_values(space: ParameterSpace, theta: FloatArray) -> dict[str, tuple[list[float], list[str]]]:
-    """Return values without a MuJoCo field, by their name in ``<custom>``: values and elements."""
+def custom_name(kind: str) -> str:
+    """Return the name under which ``<custom>`` has the values of a kind without a MuJoCo field."""
+    return f"deal_hw.{kind.removeprefix('servo_')}"
+
+
+def _write_lags(model: Any, space: ParameterSpace, theta: FloatArray) -> set[str]:
+    """Write lags of actuators with a filter into that; return their names. Other lags have no field."""
+    values, found = dict(zip(space.names, theta, strict=True)) | space.known, set()
+    for parameter in space.parameters:
+        for name in parameter.elements if parameter.kind == "command_lag" else ():
+            actuator = element_id(model, "actuator", name)
+            if filtered(model, actuator):
+                model.actuator_dynprm[actuator, 0] = values[parameter.name]
+                found.add(name)
+    return found
+
+
+def device_values(
+    space: ParameterSpace, theta: FloatArray, filters: Collection[str] = ()
+) -> dict[str, tuple[list[float], list[str]]]:
+    """Return values without a MuJoCo field, by their name in ``<custom>``: values and elements.
+
+    Args:
+        space: The parameters.
+        theta: Their values, (K,).
+        filters: Actuators whose lag is that of their filter in the MJCF.
+    """
     values = dict(zip(space.names, np.asarray(theta, dtype=float), strict=True)) | space.known
     found: dict[str, tuple[list[float], list[str]]] = {}
     for parameter in space.parameters:
-        if parameter.kind in DEVICE_KINDS:
-            data, elements = found.setdefault(f"deal_hw.{parameter.kind.removeprefix('servo_')}", ([], []))
-            for element in parameter.elements:
+        native = filters if parameter.kind == "command_lag" else ()
+        if parameter.kind in DEVICE_KINDS and not set(parameter.elements) <= set(native):
+            data, elements = found.setdefault(custom_name(parameter.kind), ([], []))
+            for element in (e for e in parameter.elements if e not in native):
                 data.append(float(values[parameter.name]))
                 elements.append(element)
     return found

@@ -240,11 +240,21 @@ class MjcfChanges:
         element = self._find("actuator", i)
         gain, bias = want.actuator_gainprm[i], want.actuator_biasprm[i]
         same = all(getattr(have, f)[i] == getattr(want, f)[i] for f in tables.TYPE_FIELDS)
-        same = same and np.array_equal(have.actuator_dynprm[i], want.actuator_dynprm[i])
+        timed = have.actuator_dynprm[i, 0] != want.actuator_dynprm[i, 0]
+        same = same and np.array_equal(have.actuator_dynprm[i, 1:], want.actuator_dynprm[i, 1:])
         position = np.array_equal(bias, np.append([0.0, -gain[0], bias[2]], np.zeros(len(bias) - 3)))
         plain = same and not gain[1:].any()
         if element.name == "position" and plain and position and bias[2] <= 0 <= gain[0]:
             self._set("actuator", i, element, "kp", number(gain[0]), number(have.actuator_gainprm[i, 0]))
+            if timed:
+                self._set(
+                    "actuator",
+                    i,
+                    element,
+                    "timeconst",
+                    number(want.actuator_dynprm[i, 0]),
+                    number(have.actuator_dynprm[i, 0]),
+                )
             if bias[2] != have.actuator_biasprm[i, 2] or element.get("kv") is not None:
                 self._set(
                     "actuator", i, element, "kv", number(-bias[2]), number(-have.actuator_biasprm[i, 2])
@@ -253,6 +263,7 @@ class MjcfChanges:
         elif (
             element.name == "velocity"
             and plain
+            and not timed
             and np.array_equal(bias, np.append([0, 0, -gain[0]], bias[3:] * 0))
         ):
             self._set("actuator", i, element, "kv", number(gain[0]), number(have.actuator_gainprm[i, 0]))

@@ -10,19 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import actuator_of
+from deal_hw.sim.parameters.drive import JointDrive, drive_of
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import HINGE, SLIDE, joint_of
 
 WINDOW_TICKS = 20
 """Control periods in a search's longest window, whose length is ``--window``."""
 
-_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 DRIVEN = {
     int(mujoco.mjtTrn.mjTRN_TENDON): "tendon",
@@ -96,23 +95,24 @@ def describe(
     actuators = [actuator_of(model, name) for name in actuated]
     _check_actuators(model, actuators, actuated)
     # Without actuators there is nothing to command, as with motors that are off.
-    kinds = {_actuation(model, i, name) for i, name in zip(actuators, actuated, strict=True)} or {"motor"}
-    if len(kinds) > 1:
+    drives = [_drive(model, i, name) for i, name in zip(actuators, actuated, strict=True)]
+    servo = any(drive.takes == "position" for drive in drives)
+    others = [name for name, drive in zip(actuated, drives, strict=True) if drive.takes != "position"]
+    if servo and others:
         raise ConfigurationError(
-            "some actuators of the model are position servos, some are motors; calibration takes one kind"
+            f"some actuators of the model are position servos, some are motors ({', '.join(others)}); "
+            "calibration takes one kind"
         )
-    actuation = kinds.pop()
-    servo = actuation == "position"
-    limits = [_effort_limit(model, i, servo) for i in actuators]
     return RobotDescription(
         name=mjcf.stem,
         joint_names=tuple(joints),
         actuated=tuple(actuated),
         position_units=tuple("m" if model.jnt_type[j] == SLIDE else "rad" for j in index),
         default_position=tuple(float(model.qpos0[model.jnt_qposadr[j]]) for j in index),
-        stiffness=tuple(float(model.actuator_gainprm[i, 0]) if servo else 0.0 for i in actuators),
-        damping=tuple(float(-model.actuator_biasprm[i, 2]) if servo else 0.0 for i in actuators),
-        effort_limit=tuple(limits),
+        stiffness=tuple(drive.stiffness for drive in drives),
+        damping=tuple(drive.damping if servo else 0.0 for drive in drives),
+        # A motor has its effort at a control of 1.
+        effort_limit=tuple(drive.effort_limit if servo else abs(drive.gain) for drive in drives),
         speed_limit=(math.inf,) * len(actuated),
         control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
         device_rate_hz=1.0 / rates.step_s,
@@ -122,13 +122,13 @@ def describe(
             noise=(0.0,) * len(joints), resolution=(0.0,) * len(joints), velocity_window_s=0.0
         ),
         mjcf=mjcf,
-        actuation=actuation,
+        actuation="position" if servo else "motor",
         floating_base=free,
         sources={
             "joint_names": "the recording's column map",
-            "stiffness": "gain of the MJCF's position actuators",
-            "damping": "velocity term of the same actuators",
-            "effort_limit": "forcerange of the same actuators; infinite where there is none",
+            "stiffness": "gain of the MJCF's position actuators, at the joint",
+            "damping": "velocity term of the same actuators, at the joint",
+            "effort_limit": "forcerange of the same actuators, at the joint; infinite where there is none",
             "state_rate_hz": "the recording's own stamps",
             "device_rate_hz": "the physics step: the MJCF's timestep fitted into the sampling period",
             "control_rate_hz": "unit of window lengths: the sampling rate over a whole number",
@@ -191,40 +191,8 @@ def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[st
         )
 
 
-def _actuation(model: Any, actuator: int, joint: str) -> str:
-    """Return an actuator's kind of command, as in :class:`RobotDescription`."""
-    name = model.actuator(actuator).name or f"of joint {joint}"
-    gain, bias = model.actuator_gainprm[actuator], model.actuator_biasprm[actuator]
-    plain = (
-        int(model.actuator_trntype[actuator]) == _JOINT
-        and int(model.actuator_dyntype[actuator]) == int(mujoco.mjtDyn.mjDYN_NONE)
-        and int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_FIXED)
-    )
-    affine = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    if plain and affine and gain[0] > 0 and bias[0] == 0 and np.isclose(gain[0], -bias[1]):
-        if not np.isclose(model.actuator_gear[actuator, 0], 1.0):
-            raise ConfigurationError(
-                f"position actuator {name!r} has gear {model.actuator_gear[actuator, 0]:g}, recordings hold "
-                "joint positions; write gear 1, kp and kv times the gear squared, forcerange times the gear, "
-                "ctrlrange divided by it"
-            )
-        return "position"
-    if plain and not affine and not np.any(bias):
-        return "motor"
-    raise ConfigurationError(
-        f"actuator {name!r} is neither a position servo (<position kp kv>) nor a motor (<motor>); "
-        "calibration knows these two: replace it in a copy of the MJCF"
-    )
-
-
-def _effort_limit(model: Any, actuator: int, servo: bool) -> float:
-    """Return a servo's symmetric force limit, infinite for none; a motor's torque at control 1."""
-    if not servo:
-        return float(abs(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0]))
-    low, high = model.actuator_forcerange[actuator]
-    if not model.actuator_forcelimited[actuator] or not np.isclose(-low, high):
-        return math.inf
-    return float(high)
+def _drive(model: Any, actuator: int, joint: str) -> JointDrive:
+    return drive_of(model, actuator, model.actuator(actuator).name or f"of joint {joint}")
 
 
 def _no_limits(joints: int, actuated: int) -> SafetyLimits:

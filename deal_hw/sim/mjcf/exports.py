@@ -1,12 +1,14 @@
-"""Calibrated values for other simulators: actuator tables, URDF-side values and plain YAML.
+"""Calibrated values for other simulators: actuator tables, URDF-side values, plain YAML and BAM's JSON.
 
 Each file lists the values that its format cannot hold, and the unidentified ones. Field names are those of
-Isaac Lab's ``ActuatorBaseCfg`` and ``DelayedPDActuatorCfg``, of mjlab's ``BuiltinPositionActuatorCfg`` (1.6),
-and of URDF.
+Isaac Lab's ``ActuatorBaseCfg``, ``DelayedPDActuatorCfg`` and ``DCMotorCfg``, of mjlab's
+``BuiltinPositionActuatorCfg`` and ``DcMotorActuatorCfg`` (1.6), and of URDF.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,8 +20,14 @@ import yaml
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.parameters import Parameter
+from deal_hw.sim.engine.batch import COMMAND_KINDS
 from deal_hw.sim.engine.model import RobotModel, model_with
+from deal_hw.sim.mjcf.bam import BAM, bam_parameters, drive_texts, parameter_texts
+from deal_hw.sim.parameters import present
+from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
+from deal_hw.sim.parameters.inertia import INERTIA_KINDS
+from deal_hw.sim.parameters.laws import FREE_SPEED, LAW_KINDS
 
 ACTUATORS = "actuators.yaml"
 URDF = "urdf.yaml"
@@ -36,9 +44,19 @@ _ACTUATOR_KINDS: Mapping[str, str] = {
     "command_delay": "delay_s",
 }
 """Kind of parameter -> column of the actuator table."""
+_MOTOR_KINDS = {**_ACTUATOR_KINDS, FREE_SPEED: "velocity_limit"}
+"""The same for the tables of motors, whose effort falls with speed."""
 _URDF_KINDS = ("dof_damping", "dof_frictionloss", "servo_effort_limit", "rod_length")
 """Kinds with a field in URDF, beside those of bodies' masses and inertias."""
-_BODY_KINDS = ("body_mass", "body_inertia", "body_ipos_x", "body_ipos_y", "body_ipos_z", "rod_length")
+_BODY_KINDS = (
+    "body_mass",
+    "body_inertia",
+    "body_ipos_x",
+    "body_ipos_y",
+    "body_ipos_z",
+    "rod_length",
+    *(kind.name for kind in INERTIA_KINDS),
+)
 
 _ISAAC_LAB = (
     "damping is the servo's D gain and the joint's own damping together: the table has one field. The "
@@ -52,6 +70,13 @@ _MJLAB = (
     "velocity_limit has no field: no set-point is limited in speed",
     "delay_min_lag and delay_max_lag are both the latency in whole physics steps, because mjlab draws from "
     "a range at each step",
+)
+_ISAAC_LAB_MOTORS = (
+    "the delay has no field: DCMotorCfg has none",
+    "back-EMF brakes faster than velocity_limit in the calibrated model, there only up to effort_limit",
+)
+_MJLAB_MOTORS = (
+    "back-EMF brakes faster than velocity_limit in the calibrated model, there only up to effort_limit",
 )
 _URDF = (
     "armature has no field: most importers set 0",
@@ -77,9 +102,13 @@ def write_exports(
         URDF: urdf_values(robot, result),
         VALUES: plain_values(result),
     }
+    tables[BAM] = bam_parameters(robot, result)
     for name, values in tables.items():
         marked = {"format": values["format"], **(judged or {}), **_marks(result), **values}
-        text = yaml.safe_dump(marked, sort_keys=False, width=110)
+        if name == BAM:
+            text = json.dumps(marked, indent=2, ensure_ascii=False) + "\n"
+        else:
+            text = yaml.safe_dump(marked, sort_keys=False, width=110)
         (folder / name).write_text(text, encoding="utf-8")
     return list(tables)
 
@@ -93,7 +122,8 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
     """Return the actuators of the calibrated model in the formats of Isaac Lab and mjlab.
 
     A motor that takes efforts has no gains: it is not in Isaac Lab's columns, and mjlab's fields are None.
-    Values are at the joint, gears included.
+    Values are at the joint, gears included. Servos whose effort falls with speed stand a second time, under
+    ``isaac_lab_motors`` and ``mjlab_motors``: as the classes that have that law.
     """
     model = model_with(robot, result.space, result.estimate)
     rows = {
@@ -110,6 +140,13 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
     }
     for joint in isaac["damping"]:
         isaac["damping"][joint] += rows[joint]["joint_damping"]
+    motors = {joint: row for joint, row in rows.items() if row["free_speed"] and row["effort_limit"]}
+    drives = [
+        text
+        for number, drive in enumerate(dataclasses.replace(robot, model=model).drives)
+        for text in (drive_texts(result, drive, robot.actuator_names[number]) if drive is not None else ())
+    ]
+    lost, motors_lost = (drives + _left_out(result, kinds) for kinds in (_ACTUATOR_KINDS, _MOTOR_KINDS))
     blind = [result.space[name] for name in result.without_value]
     unidentified = {
         joint: [
@@ -128,25 +165,59 @@ def actuator_tables(robot: RobotModel, result: CalibrationResult) -> dict[str, A
             **isaac,
             "min_delay": steps["min"],
             "max_delay": steps["max"],
-            "cannot_express": [*_ISAAC_LAB, *_left_out(result, _ACTUATOR_KINDS)],
+            "cannot_express": [*_ISAAC_LAB, *lost],
         },
         "mjlab": {
             "class": "BuiltinPositionActuatorCfg",
-            "actuators": [
-                {
-                    "target_names_expr": [joint],
-                    "stiffness": row["stiffness"],
-                    "damping": row["damping"],
-                    "effort_limit": row["effort_limit"],
-                    "armature": row["armature"],
-                    "frictionloss": row["friction"],
-                    "viscous_damping": row["joint_damping"],
-                    **dict.fromkeys(("delay_min_lag", "delay_max_lag"), round(row["delay_s"] / robot.step_s)),
-                }
-                for joint, row in rows.items()
-            ],
-            "cannot_express": [*_MJLAB, *_left_out(result, _ACTUATOR_KINDS)],
+            "actuators": [_mjlab(joint, row, robot.step_s) for joint, row in rows.items()],
+            "cannot_express": [*_MJLAB, *lost],
         },
+        **_section(
+            "isaac_lab_motors",
+            "DCMotorCfg",
+            [
+                {
+                    "joint_names_expr": [joint],
+                    "stiffness": row["stiffness"],
+                    "damping": row["damping"] + row["joint_damping"],
+                    "armature": row["armature"],
+                    "friction": row["friction"],
+                    "effort_limit": row["effort_limit"],
+                    "saturation_effort": row["effort_limit"],
+                    "velocity_limit": row["free_speed"],
+                }
+                for joint, row in motors.items()
+            ],
+            [*_ISAAC_LAB[:2], *_ISAAC_LAB_MOTORS, *motors_lost],
+        ),
+        **_section(
+            "mjlab_motors",
+            "DcMotorActuatorCfg",
+            [
+                _mjlab(joint, row, robot.step_s)
+                | {"saturation_effort": row["effort_limit"], "velocity_limit": row["free_speed"]}
+                for joint, row in motors.items()
+            ],
+            [_MJLAB[1], *_MJLAB_MOTORS, *motors_lost],
+        ),
+    }
+
+
+def _section(place: str, name: str, actuators: list[dict[str, Any]], lost: list[str]) -> dict[str, Any]:
+    """Return the table of servos whose effort falls with speed, under its place; none without such."""
+    return {place: {"class": name, "actuators": actuators, "cannot_express": lost}} if actuators else {}
+
+
+def _mjlab(joint: str, row: Mapping[str, Any], step_s: float) -> dict[str, Any]:
+    return {
+        "target_names_expr": [joint],
+        "stiffness": row["stiffness"],
+        "damping": row["damping"],
+        "effort_limit": row["effort_limit"],
+        "armature": row["armature"],
+        "frictionloss": row["friction"],
+        "viscous_damping": row["joint_damping"],
+        **dict.fromkeys(("delay_min_lag", "delay_max_lag"), round(row["delay_s"] / step_s)),
     }
 
 
@@ -165,7 +236,7 @@ def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
             row = _actuator(robot, model, result, description.actuated.index(joint))
             limit["effort"], damping = row["effort_limit"], row["joint_damping"]
         joints[joint] = {"dynamics": {"damping": damping, "friction": friction}, "limit": limit}
-    moved = [p for p in result.space.parameters if p.kind in _BODY_KINDS]
+    moved = [p for p in present(result.space, robot.absent).parameters if p.kind in _BODY_KINDS]
     bodies = dict.fromkeys(name for parameter in moved for name in parameter.elements)
     return {
         "format": "deal_hw.urdf/1",
@@ -200,28 +271,38 @@ def plain_values(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
+def laws_without_a_field(result: CalibrationResult) -> list[str]:
+    """Return the names of calibrated laws that neither Isaac Lab, nor mjlab, nor a URDF can express."""
+    kinds = {*(kind.name for kind in LAW_KINDS), *COMMAND_KINDS} - {FREE_SPEED}
+    return [p.name for p in result.space.parameters if p.kind in kinds]
+
+
 def _actuator(robot: RobotModel, model: Any, result: CalibrationResult, number: int) -> dict[str, Any]:
     """Return one actuator's values at its joint, in SI."""
     actuator = robot.actuator[number]
     joint = robot.description.joint_names.index(robot.description.actuated[number])
     dof, gear = robot.qvel[joint], abs(float(model.actuator_gear[actuator, 0]))
-    kp, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator]
-    affine = int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
-    servo = affine and bool(np.isclose(kp, -bias[1]))
+    drive = drive_of(model, actuator, robot.actuator_names[number])
+    servo = drive.takes == "position"
     effort = None
     if model.actuator_forcelimited[actuator]:
         effort = float(np.abs(model.actuator_forcerange[actuator]).max()) * gear
     elif not servo and model.actuator_ctrllimited[actuator]:
-        effort = float(np.abs(model.actuator_ctrlrange[actuator]).max()) * kp * gear
+        effort = float(np.abs(model.actuator_ctrlrange[actuator]).max()) * abs(drive.gain)
+    # A motor's own damping is passive: it acts beside efforts, as the joint's.
+    passive = 0.0 if drive.takes != "effort" else drive.damping
+    gains = {"position": (drive.stiffness, drive.damping), "velocity": (0.0, drive.damping)}
+    stiffness, damping = gains.get(drive.takes, (None, None))
     return {
-        "stiffness": kp * gear**2 if servo else None,
-        "damping": -float(bias[2]) * gear**2 if servo else None,
+        "stiffness": stiffness,
+        "damping": damping,
         # MuJoCo adds those of the actuator to those of the joint.
-        "joint_damping": float(model.dof_damping[dof] + gear**2 * model.actuator_damping[actuator]),
+        "joint_damping": float(model.dof_damping[dof] + gear**2 * model.actuator_damping[actuator]) + passive,
         "armature": float(model.dof_armature[dof] + gear**2 * model.actuator_armature[actuator]),
         "friction": float(model.dof_frictionloss[dof]),
         "effort_limit": effort,
         "velocity_limit": _device_value(robot, result, "servo_speed_limit", number),
+        "free_speed": _device_value(robot, result, FREE_SPEED, number) if servo else None,
         "delay_s": float(result.latency_s) + (_device_value(robot, result, "command_delay", number) or 0.0),
     }
 
@@ -261,9 +342,4 @@ def _inertial(model: Any, body: int) -> dict[str, Any]:
 
 def _left_out(result: CalibrationResult, kinds: Sequence[str] | Mapping[str, str]) -> list[str]:
     """Return the calibrated parameters without a field in a format, with their values."""
-    values = dict(zip(result.space.names, result.estimate, strict=True)) | result.space.known
-    return [
-        f"{p.name} = {float(values[p.name]):.5g} {p.unit} ({p.kind})"
-        for p in result.space.parameters
-        if p.kind not in kinds
-    ]
+    return [text for kind, text in parameter_texts(result) if kind not in kinds]

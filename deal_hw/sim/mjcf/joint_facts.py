@@ -12,6 +12,7 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.compiling import compile_mjcf
+from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 
@@ -32,8 +33,11 @@ class JointFacts:
         command: Lowest and highest command by the actuator's ctrlrange, as in recordings (positions, or
             efforts at the joint), (J, 2); infinite for none.
         full_effort: Effort of each joint's motor at its highest command, or at 1 without a ctrlrange, (J,)
-            [N or N·m]; NaN without a motor, or with one whose force also depends on the motion.
-        gain: A command in a recording over the model's ctrl, (J,): a motor's effort at 1; 1 for all others.
+            [N or N·m]; NaN without a motor.
+        gain: A command in a recording over the model's ctrl, (J,): a motor's effort at 1; for a servo 1,
+            or what its gear or a scaled set-point makes of it.
+        speed_gain: Effort an error of the speed of each joint whose actuator takes speeds, (J,)
+            [N·m·s/rad or N·s/m]; NaN for others. Recordings hold efforts, this times the speed.
     """
 
     names: tuple[str, ...]
@@ -45,6 +49,7 @@ class JointFacts:
     command: FloatArray
     full_effort: FloatArray
     gain: FloatArray
+    speed_gain: FloatArray
 
 
 def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
@@ -88,24 +93,27 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
 
 def _actuation(
     model: mujoco.MjModel, column: Mapping[int, int]
-) -> tuple[Flags, Flags, FloatArray, FloatArray, FloatArray]:
-    """Return which joints have servos, which motors, command ranges, full efforts and gains, by column."""
+) -> tuple[Flags, Flags, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return servos, motors, command ranges, full efforts, gains, and gains of speeds, by column."""
     servo, motor = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
     command, full_effort = np.tile([-np.inf, np.inf], (len(column), 1)), np.full(len(column), np.nan)
-    gain = np.ones(len(column))
+    gain, speed_gain = np.ones(len(column)), np.full(len(column), np.nan)
     for actuator in range(model.nu):
         joint = joint_of(model, actuator)
         if joint not in column:
             continue
-        at = column[joint]
-        closes = bool(model.actuator_biasprm[actuator, 1] < 0)
+        at, drive = column[joint], find_drive(model, actuator)
+        closes = drive is not None and drive.takes == "position"
         servo[at], motor[at] = servo[at] or closes, motor[at] or not closes
-        limited, full = bool(model.actuator_ctrllimited[actuator]), 1.0
+        if drive is None:
+            continue
+        limited = bool(model.actuator_ctrllimited[actuator])
+        gain[at] = drive.scale if closes else drive.gain
         if not closes:
-            gain[at] = full = float(model.actuator_gear[actuator, 0] * model.actuator_gainprm[actuator, 0])
             most = np.max(np.abs(model.actuator_ctrlrange[actuator])) if limited else 1.0
-            if not model.actuator_biasprm[actuator].any():
-                full_effort[at] = abs(full) * most
+            full_effort[at] = abs(drive.gain) * most
+        if drive.takes == "velocity":
+            speed_gain[at] = drive.damping
         if limited:
-            command[at] = np.sort(model.actuator_ctrlrange[actuator] * full)
-    return servo, motor, command, full_effort, gain
+            command[at] = np.sort(model.actuator_ctrlrange[actuator] * gain[at])
+    return servo, motor, command, full_effort, gain, speed_gain

@@ -6,7 +6,8 @@ N simulations. The table :data:`KIND_TABLE` is explicit; new kinds go into the t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -16,17 +17,30 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters.actuator import ACTUATOR_KINDS
 from deal_hw.sim.parameters.body import BODY_KINDS
+from deal_hw.sim.parameters.effort import EFFORT_KINDS, EFFORT_NOISE
 from deal_hw.sim.parameters.fields import Array, Fields, element_id, unknown_name
 from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
+from deal_hw.sim.parameters.inertia import INERTIA_KINDS
 from deal_hw.sim.parameters.joint import JOINT_KINDS
-from deal_hw.sim.parameters.kind import Apply, Kind
+from deal_hw.sim.parameters.kind import Apply, Kind, Together
+from deal_hw.sim.parameters.laws import LAW_KINDS, check_laws
 from deal_hw.sim.parameters.sensor import SENSOR_KINDS
 from deal_hw.sim.parameters.tendon import TENDON_KINDS
 
 KIND_TABLE: Mapping[str, Kind] = MappingProxyType(
     {
         k.name: k
-        for k in (*BODY_KINDS, *JOINT_KINDS, *TENDON_KINDS, *GEOM_KINDS, *ACTUATOR_KINDS, *SENSOR_KINDS)
+        for k in (
+            *BODY_KINDS,
+            *INERTIA_KINDS,
+            *JOINT_KINDS,
+            *TENDON_KINDS,
+            *GEOM_KINDS,
+            *ACTUATOR_KINDS,
+            *LAW_KINDS,
+            *SENSOR_KINDS,
+            *EFFORT_KINDS,
+        )
     }
 )
 """Every kind by name."""
@@ -40,7 +54,7 @@ DEVICE_KINDS = tuple(name for name, kind in KIND_TABLE.items() if kind.apply is 
 """Kinds without a MuJoCo field: code between simulator, commands and recording applies them."""
 
 SENSOR_NOISE = "sensor_noise"
-"""The only kind that cannot be searched: it weights the recordings."""
+"""A kind that cannot be searched, as that of efforts: it weights the recordings."""
 
 SERVO_KINDS = ("servo_stiffness", "servo_damping", "servo_effort_limit", "servo_speed_limit")
 """Kinds that scale with the sent command."""
@@ -75,6 +89,7 @@ def check_space(model: Any, space: ParameterSpace) -> None:
         ConfigurationError: A value is outside what the kind allows, an element cannot have the parameter, two
             parameters write the same field, or another geom overrides a contact parameter.
     """
+    check_laws(space)
     owner: dict[tuple[str, str], str] = {}
     for p in space.parameters:
         kind = find_kind(p.kind)
@@ -94,10 +109,17 @@ def check_space(model: Any, space: ParameterSpace) -> None:
                 )
         if p.kind in ("geom_friction", "geom_restitution"):
             check_partners(model, p.kind, p.elements, p.low)
+    for (name, element), first in owner.items():
+        for other in KIND_TABLE[name].excludes:
+            if (other, element) in owner:
+                raise ConfigurationError(
+                    f"parameters {first!r} ({name}) and {owner[other, element]!r} ({other}) both change the "
+                    f"inertia of {element!r}; keep one of them"
+                )
 
 
 def _check_searchable(p: Parameter) -> None:
-    if p.kind == SENSOR_NOISE and not p.known:
+    if p.kind in (SENSOR_NOISE, EFFORT_NOISE) and not p.known:
         raise ConfigurationError(
             f"parameter {p.name!r}: noise of a sensor changes no prediction, so no search can find it; "
             "leave it out (it is estimated from the recording) or give the value you measured, "
@@ -115,6 +137,23 @@ def _check_bounds(p: Parameter, kind: Kind) -> None:
         raise ConfigurationError(f"parameter {p.name!r} names no {kind.element}; list its `elements`")
 
 
+def present(space: ParameterSpace, absent: Collection[tuple[str, str]]) -> ParameterSpace:
+    """Return the parameters without elements that are in another set-up only; some may have none.
+
+    Args:
+        space: The parameters.
+        absent: Type and name of elements that a model lacks, such as ("body", "payload").
+    """
+    if not absent:
+        return space
+    return ParameterSpace(
+        dataclasses.replace(
+            p, elements=tuple(e for e in p.elements if (find_kind(p.kind).element, e) not in absent)
+        )
+        for p in space.parameters
+    )
+
+
 def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> None:
     """Write free parameters (N, K), and the known ones, into the fields of N simulations.
 
@@ -130,8 +169,15 @@ def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> Non
     # Kinds that scale or shift a field start from the model each time, or changes would accumulate.
     for field in sorted({field for kind, _ in used if kind.relative for field in kind.writes}):
         fields.get(field)[:] = getattr(fields.model, field)
-    for _, parameter in sorted(used, key=lambda pair: pair[0].order):
+    waiting: dict[tuple[Together, str], dict[str, Array]] = {}
+    for kind, parameter in sorted(used, key=lambda pair: pair[0].order):
         values = columns.get(parameter.name)
         if values is None:
             values = np.full(count, parameter.nominal)
-        KINDS[parameter.kind](fields, parameter.elements, values)
+        if kind.together is None:
+            KINDS[parameter.kind](fields, parameter.elements, values)
+            continue
+        for element in parameter.elements:
+            waiting.setdefault((kind.together, element), {})[parameter.kind] = values
+    for (write, element), parts in waiting.items():
+        write(fields, element, parts)

@@ -1,8 +1,7 @@
-"""Parameter kinds of actuators.
+"""Parameter kinds of actuators, in units of the joint behind the gear.
 
-Position servos: force = clip(kp (setpoint - q) - kd q', +-limit). Motors: force = gain * control, joint
-torque = gear * force. The parameter ``motor_gain`` is their product, the joint torque at a control of 1: a
-gain alone has the joint's unit only where the gear is 1.
+Position servos: effort = clip(kp (setpoint - q) - kd q', +-limit). Velocity servos: effort = kd (speed - q').
+Motors: effort = gain * control - kd q'. :mod:`deal_hw.sim.parameters.drive` says how an MJCF writes them.
 """
 
 from __future__ import annotations
@@ -14,27 +13,33 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.sim.parameters.drive import drive_of, filtered, setpoint_ratio, speed_servo
 from deal_hw.sim.parameters.fields import Array, Fields, element_id
 from deal_hw.sim.parameters.kind import Kind
 
-_FIXED, _AFFINE = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtBias.mjBIAS_AFFINE)
+_AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _SERVO_ADVICE = "for a motor use motor_gain or motor_gear"
 
 
 def servo_stiffness(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set kp [N/m or N·m/rad]."""
+    """Set kp [N/m or N·m/rad]; a scaled set-point stays scaled."""
     gain, bias = fields.get("actuator_gainprm"), fields.get("actuator_biasprm")
     for name in elements:
         actuator = element_id(fields.model, "actuator", name)
-        gain[:, actuator, 0] = values
-        bias[:, actuator, 1] = -values
+        before = values / _gear(fields.model, actuator) ** 2
+        bias[:, actuator, 1] = -before
+        gain[:, actuator, 0] = before * setpoint_ratio(fields.model, actuator)
 
 
 def servo_damping(fields: Fields, elements: Sequence[str], values: Array) -> None:
-    """Set kd [N·s/m or N·m·s/rad]."""
-    bias = fields.get("actuator_biasprm")
+    """Set kd [N·s/m or N·m·s/rad]; a velocity servo's gain stays equal to it."""
+    gain, bias = fields.get("actuator_gainprm"), fields.get("actuator_biasprm")
     for name in elements:
-        bias[:, element_id(fields.model, "actuator", name), 2] = -values
+        actuator = element_id(fields.model, "actuator", name)
+        before = values / _gear(fields.model, actuator) ** 2
+        bias[:, actuator, 2] = -before
+        if speed_servo(fields.model, actuator):
+            gain[:, actuator, 0] = before
 
 
 def servo_effort_limit(fields: Fields, elements: Sequence[str], values: Array) -> None:
@@ -42,8 +47,9 @@ def servo_effort_limit(fields: Fields, elements: Sequence[str], values: Array) -
     limit = fields.get("actuator_forcerange")
     for name in elements:
         actuator = element_id(fields.model, "actuator", name)
-        limit[:, actuator, 0] = -values
-        limit[:, actuator, 1] = values
+        force = values / abs(_gear(fields.model, actuator))
+        limit[:, actuator, 0] = -force
+        limit[:, actuator, 1] = force
 
 
 def motor_gain(fields: Fields, elements: Sequence[str], values: Array) -> None:
@@ -63,14 +69,25 @@ def motor_gear(fields: Fields, elements: Sequence[str], values: Array) -> None:
         gear[:, actuator, 0] = np.copysign(values, fields.model.actuator_gear[actuator, 0])
 
 
+def _gear(model: Any, actuator: int) -> float:
+    return float(model.actuator_gear[actuator, 0])
+
+
 def _servo(model: Any, actuator: int, name: str) -> None:
-    fixed = int(model.actuator_gaintype[actuator]) == _FIXED
-    affine = int(model.actuator_biastype[actuator]) == _AFFINE
-    gain, bias = model.actuator_gainprm[actuator], model.actuator_biasprm[actuator]
-    if not (fixed and affine and np.isclose(gain[0], -bias[1])):
+    if drive_of(model, actuator, name).takes != "position":
+        gain, bias = model.actuator_gainprm[actuator], model.actuator_biasprm[actuator]
         raise ConfigurationError(
             f"actuator {name!r} is no position servo (gain {gain[0]:g}, bias {bias[:3].tolist()}); "
             f"{_SERVO_ADVICE}"
+        )
+
+
+def _damped(model: Any, actuator: int, name: str) -> None:
+    drive_of(model, actuator, name)
+    if int(model.actuator_biastype[actuator]) != _AFFINE:
+        raise ConfigurationError(
+            f"actuator {name!r} has no damping of its own (no biastype affine); search its joint's "
+            f"dof_damping; {_SERVO_ADVICE}"
         )
 
 
@@ -84,13 +101,19 @@ def _limited(model: Any, actuator: int, name: str) -> None:
 
 
 def _motor(model: Any, actuator: int, name: str) -> None:
-    fixed = int(model.actuator_gaintype[actuator]) == _FIXED
-    if not fixed or np.any(model.actuator_biasprm[actuator]):
+    takes = drive_of(model, actuator, name).takes
+    if takes == "position":
         raise ConfigurationError(f"actuator {name!r} is no motor; for a position servo use servo_stiffness")
-    if model.actuator_gear[actuator, 0] == 0:
+    if takes == "velocity":
         raise ConfigurationError(
-            f"actuator {name!r} has gear 0, so it moves nothing; give it another gear in the MJCF"
+            f"actuator {name!r} is a velocity servo; its only gain is servo_damping, effort an error of the "
+            "speed"
         )
+
+
+def _commanded(model: Any, actuator: int, name: str) -> None:
+    if drive_of(model, actuator, name).takes == "position":
+        raise ConfigurationError(f"actuator {name!r} is no motor; for a position servo use servo_stiffness")
 
 
 ACTUATOR_KINDS = (
@@ -103,7 +126,7 @@ ACTUATOR_KINDS = (
         writes=("actuator_gainprm", "actuator_biasprm"),
         along="gain and bias stay opposite",
         apply=servo_stiffness,
-        baseline=lambda m, i: float(m.actuator_gainprm[i, 0]),
+        baseline=lambda m, i: drive_of(m, i, m.actuator(i).name).stiffness,
         usable=_servo,
     ),
     Kind(
@@ -112,11 +135,11 @@ ACTUATOR_KINDS = (
         quantity="servo_damping",
         unit="N·m·s/rad",
         unit_slide="N·s/m",
-        writes=("actuator_biasprm",),
-        along="nothing; the joint's own dof_damping adds to it",
+        writes=("actuator_biasprm", "actuator_gainprm"),
+        along="a velocity servo's gain; the joint's own dof_damping adds to it",
         apply=servo_damping,
-        baseline=lambda m, i: float(-m.actuator_biasprm[i, 2]),
-        usable=_servo,
+        baseline=lambda m, i: drive_of(m, i, m.actuator(i).name).damping,
+        usable=_damped,
     ),
     Kind(
         name="servo_effort_limit",
@@ -127,7 +150,7 @@ ACTUATOR_KINDS = (
         writes=("actuator_forcerange",),
         along="both sides alike",
         apply=servo_effort_limit,
-        baseline=lambda m, i: float(m.actuator_forcerange[i, 1]),
+        baseline=lambda m, i: float(m.actuator_forcerange[i, 1] * abs(m.actuator_gear[i, 0])),
         usable=_limited,
     ),
     Kind(
@@ -177,13 +200,62 @@ ACTUATOR_KINDS = (
         spread=0.02,
     ),
     Kind(
+        name="command_lag",
+        element="actuator",
+        quantity="lag",
+        unit="s",
+        writes=(),
+        along="set-points or efforts follow commands as a first-order lag of this time constant",
+        apply=None,
+        baseline=lambda m, i: float(m.actuator_dynprm[i, 0]) if filtered(m, i) else 0.0,
+    ),
+    Kind(
+        name="command_dead_zone",
+        element="actuator",
+        quantity="dead_zone",
+        unit="of the command",
+        writes=(),
+        along="commands of a motor up to this size have no effect, larger ones lose it",
+        apply=None,
+        baseline=lambda m, i: 0.0,
+        usable=_commanded,
+        scale="linear",
+        spread=0.2,
+    ),
+    Kind(
+        name="command_asymmetry",
+        element="actuator",
+        quantity="asymmetry",
+        unit="-",
+        writes=(),
+        along="positive commands of a motor do more by this share, negative ones less",
+        apply=None,
+        baseline=lambda m, i: 0.0,
+        usable=_commanded,
+        scale="linear",
+        spread=0.3,
+        least=-1.0,
+        most=1.0,
+    ),
+    Kind(
+        name="command_saturation",
+        element="actuator",
+        quantity="saturation",
+        unit="of the command",
+        writes=(),
+        along="larger commands of a motor act as this one",
+        apply=None,
+        baseline=None,
+        usable=_commanded,
+    ),
+    Kind(
         name="servo_play",
         element="actuator",
         quantity="play",
         unit="rad",
         unit_slide="m",
         writes=(),
-        along="the joint's set-point follows where the play is used up",
+        along="a dead zone of the command: the set-point of the joint follows where the play is used up",
         apply=None,
         baseline=None,
         usable=_servo,

@@ -121,12 +121,14 @@ def _scalable(model: Any, body: int, name: str) -> None:
             )
 
 
-def _movable_centre(model: Any, body: int, name: str) -> None:
+def movable_centre(model: Any, body: int, name: str) -> None:
+    """Refuse bodies whose centre and principal axes the compiler has fixed."""
     moving_body(model, body, name)
     if model.body_simple[body]:
         raise ConfigurationError(
             f"body {name!r} has its centre of mass in its origin and was compiled to a diagonal inertia, so "
-            f'no offset is possible; write <body name="{name}" simple="false"> in the MJCF'
+            f"neither its centre nor its axes can change; write "
+            f'<body name="{name}" simple="false"> in the MJCF'
         )
 
 
@@ -203,7 +205,7 @@ BODY_KINDS = (
             along="nothing; an offset of the centre of mass in the body's frame",
             apply=apply,
             baseline=lambda m, i: 0.0,
-            usable=_movable_centre,
+            usable=movable_centre,
             scale="linear",
             spread=0.02,
             least=float("-inf"),

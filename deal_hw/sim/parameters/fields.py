@@ -68,6 +68,9 @@ _TYPES = {
 }
 _COUNTS = {"body": "nbody", "joint": "njnt", "actuator": "nu", "geom": "ngeom", "tendon": "ntendon"}
 
+ELEMENTS = tuple(_TYPES)
+"""Types of elements that parameters change."""
+
 
 def unknown_name(what: str, given: str, allowed: Iterable[str]) -> UnknownNameError:
     """Return the error for a name that is not known; it also says the nearest one, if any is near."""

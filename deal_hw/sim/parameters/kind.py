@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ FRICTION_RATIO = 20.0
 """The same for dry friction, which few models have measured: a real SO-101 has 8 to 9 times the model's."""
 
 Apply = Callable[[Fields, Sequence[str], Array], None]
+Together = Callable[[Fields, str, Mapping[str, Array]], None]
 Element = Literal["body", "joint", "geom", "actuator", "tendon"]
 
 
@@ -47,6 +48,9 @@ class Kind:
         most: Highest allowed value.
         order: Kinds of lower order are applied first.
         relative: Multiplies or adds to the fields, which are therefore reset before.
+        together: Writes the values of several kinds, (N,) each by their names, for one element at once; all
+            kinds with this function are passed to it, after all others. None: each kind is written alone.
+        excludes: Kinds with the same effect: they and this one cannot be set for one element.
     """
 
     name: str
@@ -66,6 +70,8 @@ class Kind:
     most: float = float("inf")
     order: int = 2
     relative: bool = False
+    together: Together | None = None
+    excludes: tuple[str, ...] = ()
 
     def unit_of(self, model: Any, index: int) -> str:
         """Return the unit for one element of a model."""

@@ -1,7 +1,7 @@
 """Parameter kinds of sensors: they have no MuJoCo field.
 
-A bias shifts what the simulator reports. Noise changes no prediction, so no search can find it: a known value
-weights the recording, and without one the noise is estimated from the recording itself.
+A bias shifts what the simulator reports, a scale stretches it. Noise changes no prediction, so no search can
+find it: a known value weights the recording, and without one the recording itself shows the noise.
 """
 
 from __future__ import annotations
@@ -23,6 +23,18 @@ SENSOR_KINDS = (
         scale="linear",
         spread=0.1,
         least=float("-inf"),
+    ),
+    Kind(
+        name="encoder_scale",
+        element="joint",
+        quantity="encoder_scale",
+        unit="-",
+        writes=(),
+        along="reported over true change of position; a servo closes its loop on the reported one",
+        apply=None,
+        baseline=lambda m, i: 1.0,
+        usable=one_dof_joint,
+        ratio=1.5,
     ),
     Kind(
         name="sensor_noise",

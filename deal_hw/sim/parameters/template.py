@@ -18,7 +18,15 @@ _HEAD = """\
 # Every key is explained in {page}. Nominal values are the model's.
 # A value of 0 has no ratio, so its line is commented out: give it a `nominal` or a `range`, remove the #.
 # Measure what you can: `weighed: 0.35` fixes a mass, `prior: {{mean: 0.35, std: 0.02}}` says what you expect.
+# `{{kind: inertial, elements: BODY}}` searches a body's ten inertial parameters around the model's values.
 parameters:
+"""
+_LAWS = """\
+  # Laws that no field of an MJCF holds. calibrate tries them itself where the model explains too little.
+  # To search one, or more of them, yourself:
+  # - {{kind: dof_friction_stribeck, elements: {joint}, nominal: {rest:.3g}}}  # more friction at rest by this
+  # - {{kind: dof_stribeck_speed, elements: {joint}, nominal: 0.1}}  # speed at which that has fallen to 1/e
+  # - {{kind: dof_friction_load, elements: {joint}, nominal: 0.02}}  # friction a torque through the gear
 """
 _ON = (
     "dof_frictionloss",
@@ -51,6 +59,15 @@ def template(model: Any, title: str = "this model") -> str:
             f"{title} has no named joint or actuator with a friction, damping, armature or gain above 0; "
             "name them in the MJCF and give them values"
         )
+    filters = [row for row in _rows(model, KIND_TABLE["command_lag"]) if row[1] > 0]
+    if filters:
+        lines.append("  # Filters of the MJCF: remove the # to search their time constants.\n")
+        lines += [
+            f"  # - {{kind: command_lag, elements: {_quoted(n)}}}  # {v:.6g} s\n" for n, v, _ in filters
+        ]
+    rubbing = [(name, value) for name, value, _ in _rows(model, KIND_TABLE["dof_frictionloss"]) if value > 0]
+    if rubbing:
+        lines.append(_LAWS.format(joint=_quoted(rubbing[0][0]), rest=rubbing[0][1]))
     return "".join(lines)
 
 

@@ -16,9 +16,10 @@ from deal_hw.documentation import page
 from deal_hw.errors import QUOTED, ConfigurationError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
 from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
-from deal_hw.sim.parameters import check_space, find_kind
+from deal_hw.sim.parameters import KIND_TABLE, check_space, find_kind
 from deal_hw.sim.parameters.fields import element_id, element_names, unknown_name
 from deal_hw.sim.parameters.kind import Kind
+from deal_hw.sim.parameters.kind_sets import KIND_SETS, SetPart
 
 _KEYS: Final = (
     "kind",
@@ -33,6 +34,7 @@ _KEYS: Final = (
     "weighed",
     "prior",
 )
+_SET_KEYS: Final = ("kind", "elements", "weighed", "prior")
 _GROUPS: Final = ("each", "together")
 _SCALES: Final[Mapping[str, Scale]] = {"log": "log", "linear": "linear"}
 
@@ -95,7 +97,12 @@ def _parameters(entry: Any, model: Any) -> list[Parameter]:
     for key in entry:
         if key not in _KEYS:
             raise unknown_name("key", str(key), _KEYS)
-    kind = find_kind(_text(entry, "kind"))
+    name = _text(entry, "kind")
+    if name in KIND_SETS:
+        return _set_of_kinds(entry, name, model)
+    if name not in KIND_TABLE:
+        raise unknown_name("parameter kind", name, (*KIND_TABLE, *KIND_SETS))
+    kind = find_kind(name)
     elements = _elements(entry.get("elements"), kind, model)
     group = _choice(entry, "group", _GROUPS, "each")
     if group == "each" and "name" in entry and len(elements) > 1:
@@ -106,6 +113,54 @@ def _parameters(entry: Any, model: Any) -> list[Parameter]:
         raise ConfigurationError(f"group `together` of {len(elements)} elements needs a `name`")
     groups = [tuple(elements)] if group == "together" else [(name,) for name in elements]
     return [_parameter(entry, kind, names, model) for names in groups]
+
+
+def _set_of_kinds(entry: Mapping[str, Any], name: str, model: Any) -> list[Parameter]:
+    """Return the parameters of a set of kinds, with the model's values as prior."""
+    for key in entry:
+        if key not in _SET_KEYS:
+            raise ConfigurationError(
+                f"`{key}` is not for {name}, which stands for several kinds: it takes "
+                f"{', '.join(_SET_KEYS)}; for other ranges write an entry for each kind "
+                f"({', '.join(kind for part in KIND_SETS[name].values() for kind in part.kinds)})"
+            )
+    parts = KIND_SETS[name]
+    stds = entry.get("prior", {})
+    if not isinstance(stds, Mapping):
+        raise ConfigurationError(
+            f"`prior` of {name} has a standard deviation for each part that differs from the usual, such as "
+            f"{{mass: 0.02, com: 0.003}}; got {shown(stds)}"
+        )
+    for part in stds:
+        if part not in parts:
+            raise unknown_name(f"part of {name}", str(part), parts)
+    kinds = [find_kind(kind) for part in parts.values() for kind in part.kinds]
+    every = {element: None for kind in kinds for element in _elements(entry.get("elements"), kind, model)}
+    if "weighed" in entry and len(every) > 1:
+        raise ConfigurationError(
+            f"`weighed` is one body's mass, but the entry names {len(every)}: {short(list(every))}"
+        )
+    found = []
+    for element in every:
+        for part_name, part in parts.items():
+            std = _number(stds.get(part_name, part.prior_std), f"prior of {part_name}")
+            for kind in part.kinds:
+                weighed = entry.get("weighed") if kind == "body_mass" else None
+                found += _part(kind, element, part, std, weighed, model)
+    return found
+
+
+def _part(kind: str, element: str, part: SetPart, std: float, weighed: Any, model: Any) -> list[Parameter]:
+    if weighed is not None:
+        return _parameters({"kind": kind, "elements": [element], "weighed": weighed}, model)
+    found = find_kind(kind)
+    assert found.baseline is not None
+    mean = found.baseline(model, element_id(model, found.element, element))
+    wide = (
+        {"ratio": part.reach} if found.scale == "log" else {"range": [mean - part.reach, mean + part.reach]}
+    )
+    prior = {"mean": mean, "std": std}
+    return _parameters({"kind": kind, "elements": [element], "prior": prior, **wide}, model)
 
 
 def _elements(value: Any, kind: Kind, model: Any) -> list[str]:

@@ -21,6 +21,7 @@ SAMPLED = {
     "sample": 1,
     "position": 2,
     "velocity": 2,
+    "effort": 2,
     "usable": 1,
     "reported": 1,
     "reference": 2,
@@ -56,6 +57,8 @@ class SampledEpisode:
             None if all positions were measured.
         noise_free: Whether the whole state is reported without any error, as only a simulated target does.
         name: Name of its source for messages, mostly a file's.
+        effort: Recorded efforts of the joints, (T, J); NaN where there is none. None: no joint has any.
+        setup: Name of the robot's set-up, such as one with a payload; "" for the model itself.
     """
 
     step_s: float
@@ -77,6 +80,8 @@ class SampledEpisode:
     estimate_std: FloatArray | None = None
     noise_free: bool = False
     name: str = ""
+    setup: str = ""
+    effort: FloatArray | None = None
 
     @property
     def channels(self) -> IntArray:
@@ -156,9 +161,11 @@ def align(trajectory: Trajectory, description: RobotDescription, name: str = "")
     usable = armed[rows] & known[rows] & ((trajectory.status[rows] & int(Status.WATCHDOG)) == 0)
     usable &= gap <= 2 * round(description.device_rate_hz / description.state_rate_hz)
     usable &= np.isfinite(trajectory.position[rows]).all(axis=1)
+    effort = trajectory.effort[rows]
     return SampledEpisode(
         step_s=step_s,
         sample=sample,
+        effort=effort if np.isfinite(effort).any() else None,
         position=trajectory.position[rows],
         velocity=trajectory.velocity[rows],
         target=trajectory.position_target[in_force],
@@ -220,6 +227,7 @@ def fill_gaps(episode: SampledEpisode, longest_s: float = 0.05) -> SampledEpisod
     def whole(std: FloatArray) -> FloatArray:
         return np.broadcast_to(std, (len(episode.sample), 2 * episode.position.shape[1]))
 
+    effort = episode.effort
     # A sample before a gap was marked as unusable only for that; now it counts whether the gap is bridged.
     sound = both & ((episode.usable) | (np.diff(episode.sample, append=episode.sample[-1]) > stride))
     return dataclasses.replace(
@@ -227,6 +235,7 @@ def fill_gaps(episode: SampledEpisode, longest_s: float = 0.05) -> SampledEpisod
         sample=regular,
         position=np.where(reported[:, None], episode.position[after], line(episode.position)),
         velocity=np.where(reported[:, None], episode.velocity[after], line(episode.velocity)),
+        effort=None if effort is None else np.where(reported[:, None], effort[after], np.nan),
         usable=sound[before] & sound[after] & bridged,
         reported=reported,
         reference=None if episode.reference is None else episode.reference[after],
@@ -260,6 +269,7 @@ def thin(episode: SampledEpisode, rate_hz: float) -> SampledEpisode:
         sample=whole.sample[kept],
         position=whole.position[kept],
         velocity=whole.velocity[kept],
+        effort=None if whole.effort is None else whole.effort[kept],
         usable=np.minimum.reduceat(whole.usable, kept),
         reported=None if whole.reported is None else whole.reported[kept],
         reference=None if whole.reference is None else whole.reference[kept],

@@ -52,6 +52,8 @@ def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGa
         return None
     model, data = robot.model, mujoco.MjData(robot.model)
     index = list(description.actuated_index)
+    # A constant effort of the actuator carries its part without any deviation.
+    offset = np.array([0.0 if drive is None else drive.offset for drive in robot.drives])
     loads, deviations = [], []
     for episode in episodes:
         length = max(round(BLOCK_S / episode.period_s), 1)
@@ -63,7 +65,7 @@ def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGa
             data.qpos[list(robot.qpos)] = mean
             mujoco.mj_forward(model, data)
             carried = data.qfrc_bias - data.qfrc_passive
-            loads.append(carried[list(robot.qvel)][index])
+            loads.append(carried[list(robot.qvel)][index] - offset)
             deviations.append(command[rows].mean(axis=0) - mean[index])
     load, off = np.array(loads).reshape(-1, len(index)), np.array(deviations).reshape(-1, len(index))
     both, power = np.sum(load * off, axis=0), np.sum(load**2, axis=0)

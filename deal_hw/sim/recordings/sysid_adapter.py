@@ -28,7 +28,7 @@ import numpy as np
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
-from deal_hw.sim.engine.model import RobotModel, model_with
+from deal_hw.sim.engine.model import RobotModel, drop_filters, model_with
 from deal_hw.sim.parameters import KINDS
 from deal_hw.sim.parameters.fields import BatchFields
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -339,7 +339,7 @@ class _Bridge:
         repeat = round(episode.step_s / self.robot.step_s)
         held = np.repeat(path[at : at + windows.length * windows.stride], repeat, axis=0)
         control = np.zeros((len(held) + 1, self.robot.model.nu))
-        control[:-1, list(self.robot.actuator)] = held
+        control[:-1, list(self.robot.actuator)] = held / self.robot.command_scale
         control[-1] = control[-2]
         return control
 
@@ -352,6 +352,7 @@ class _Bridge:
             if len(self._models) > 4 * (len(self.space) + 1) * len(self._sent):
                 self._models.clear()
             model = model_with(dataclasses.replace(self.robot, model=self._nominal), self.space, theta)
+            drop_filters(model)
             if self.robot.description.actuation == "position":
                 self._batch.set_parameters(theta[None])
                 self._batch.set_sent(*self._sent[id(spec)])

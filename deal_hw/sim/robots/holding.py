@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.sim.engine.compiling import DIVERGED
+from deal_hw.sim.engine.model import command_scale
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.types import FloatArray
 
@@ -49,9 +50,10 @@ def hold(robot: UserRobot) -> Holding:
         data.qpos[model.joint(name).qposadr[0]] = position
     start = np.array([description.default_position[i] for i in description.actuated_index])
     if description.actuation == "position":
+        scale = command_scale(model, range(model.nu))
         for actuator in range(model.nu):
             joint = model.joint(int(model.actuator_trnid[actuator, 0])).name
-            data.ctrl[actuator] = start[description.actuated.index(joint)]
+            data.ctrl[actuator] = start[description.actuated.index(joint)] / scale[actuator]
     at, moving = [int(j.qposadr[0]) for j in driven], [int(j.dofadr[0]) for j in driven]
     steps = max(round(SECONDS / model.opt.timestep), 4)
     speed = np.empty((steps, len(driven)))

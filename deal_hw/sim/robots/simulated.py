@@ -105,6 +105,7 @@ class SimulatedRobot(Robot):
         self._coming: list[tuple[int, JointCommand]] = []
         self._home = np.array(self.description.default_position)
         self._setpoint = self._rest()
+        self._memory = self._batch.commands.memory(self._setpoint[None])
         self._reset()
 
     def connect(self) -> None:
@@ -193,6 +194,7 @@ class SimulatedRobot(Robot):
         d = self.description
         self._batch.set_sent(np.array(d.stiffness), np.array(d.damping), np.array(d.effort_limit))
         self._batch.set_state(self._home[None], np.zeros((1, len(self._home))))
+        self._memory = self._batch.commands.memory(self._rest()[None])
 
     def _advance_to(self, step: int) -> None:
         while self._step < step:
@@ -205,6 +207,8 @@ class SimulatedRobot(Robot):
             self._step = end
 
     def _advance(self, setpoint: FloatArray) -> None:
+        if self._batch.commands.any:
+            setpoint, self._memory = self._batch.commands.act(setpoint, self._memory, self._robot.step_s)
         position, _ = self._batch.advance(setpoint)
         if not np.isfinite(position).all():
             raise CalibrationError(

@@ -234,6 +234,13 @@ def sensitive_parameters(
             "Add a recording with commands to find them"
         )
         return space.with_known({name: space[name].nominal for name in found.unseen})
+    expected = {n: mean for n in found.unseen if (mean := space[n].prior_mean) is not None}
+    if expected and len(expected) < len(space):
+        say(
+            "no trace in these recordings, so these keep the value that their prior expects: "
+            f"{', '.join(expected)}"
+        )
+        space, found = space.with_known(expected), found.without(expected)
     require_sensitive(found)
     if found.faint:
         say(

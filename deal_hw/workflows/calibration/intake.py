@@ -31,6 +31,7 @@ from deal_hw.workflows.calibration.settings import (
     OwnDatasetSettings,
     UserRobotSettings,
 )
+from deal_hw.workflows.calibration.setups import given_setups, in_setups
 from deal_hw.workflows.calibration.source import Division, Source
 from deal_hw.workflows.say import Say, silent
 
@@ -138,6 +139,9 @@ def _extra(name: str) -> Iterator[None]:
 
 def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> CalibrationInput:
     """Align the recordings, divide them, and set what they do not show or already tell."""
+    setups = given_setups(settings)
+    if setups is not None:
+        source = in_setups(source, setups, settings.named(), say)
     robot, space, division = source.robot, source.space, source.division
     trajectories = [trajectory for _, trajectory in (*source.fitted, *source.held)]
     if division is not None:
@@ -197,6 +201,8 @@ def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode
             episode = while_walking(episode, trajectory)
     if source.division is not None:
         episode = fill_gaps(episode)
+    if source.setups is not None:
+        episode = source.setups.with_gains(episode, robot)
     return episode if source.sample_hz is None else thin(episode, source.sample_hz)
 
 

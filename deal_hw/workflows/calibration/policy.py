@@ -111,6 +111,12 @@ def recorded_policy(
             f"the requested velocity of the recordings changes (it is {wish!r}), but the simulators take "
             "one fixed velocity; record with --velocity X,Y,YAW"
         )
+    if any(run.get("hold_heading") for run in runs.values()):
+        raise InsufficientDataError(
+            "the recordings were made with --hold-heading, so the requested turn depended on the robot, but "
+            "the simulators take one fixed velocity; record without it, or use a method that needs no "
+            "policy: eki, deal, deal-paper-replay"
+        )
     policy = _opened(dataset, digest, given, "that moved the robot")
     ahead, left, turn = source.reach()[0]
     return PopulationDemonstration(policy, description, (float(ahead), float(left), float(turn)))

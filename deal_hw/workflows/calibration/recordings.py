@@ -54,13 +54,15 @@ def read_tables(
 
 
 def kinds_of(facts: JointFacts) -> JointKinds:
-    """Return which joints of a model slide, and which have motors."""
+    """Return which joints of a model slide, and which have motors or velocity servos."""
     from deal_hw.data.importing.columns import JointKinds
 
+    speeds = {n: float(g) for n, g in zip(facts.names, facts.speed_gain, strict=True) if np.isfinite(g)}
     motors = zip(facts.names, ~facts.servo & np.isfinite(facts.full_effort), facts.full_effort, strict=True)
     return JointKinds(
         slides=frozenset(n for n, unit in zip(facts.names, facts.units, strict=True) if unit == "m"),
-        motors={name: float(full) for name, motor, full in motors if motor},
+        motors={name: float(full) for name, motor, full in motors if motor and name not in speeds},
+        speeds=speeds,
     )
 
 

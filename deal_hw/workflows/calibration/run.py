@@ -31,6 +31,8 @@ from deal_hw.calibration import (
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError
 from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
+from deal_hw.scale.where import task_map
+from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSettings
 from deal_hw.workflows.say import Say, silent, to_stderr
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldoutErrors
     from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.engine.warp_support import WantedEngine
     from deal_hw.sim.recordings.episode import SampledEpisode
     from deal_hw.workflows.calibration.intake import CalibrationInput
 
@@ -238,6 +241,7 @@ def calibrate_input(
         method=method,
         budget=settings.budget,
         thorough=settings.checks == "all",
+        laws=settings.laws,
         rng=np.random.default_rng(settings.seed),
         latency_s=settings.latency,
         latency_range_s=settings.latency_range,
@@ -251,6 +255,8 @@ def calibrate_input(
         smoothing_s=work.smoothing_s,
         starts=settings.starts,
         start_std=dict(settings.start_std),
+        tasks=task_map(settings.ray),
+        engine=settings.engine,
     )
 
 
@@ -276,6 +282,9 @@ def calibrate_episodes(
     starts: Literal["recorded", "drawn"] | None = "recorded",
     start_std: Mapping[str, float] | None = None,
     thorough: bool = False,
+    tasks: TaskMap | None = None,
+    laws: bool = True,
+    engine: WantedEngine = "mujoco",
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid, without writing results.
 
@@ -304,15 +313,25 @@ def calibrate_episodes(
         start_std: Standard deviation of entries of drawn start states, by name; others have the recordings'
             own.
         thorough: Run checks to their end where they take more physics steps than the fits.
+        tasks: Does fits that do not depend on each other; None: this process.
+        laws: Take a law that the model lacks where it predicts better.
+        engine: What simulates the population of a search.
     """
     try:
         from threadpoolctl import threadpool_limits
 
         from deal_hw.calib.data.checks import check_delays, target_changes
+        from deal_hw.calib.data.effort_checks import check_efforts
         from deal_hw.calib.data.noise import SMOOTHING_S
         from deal_hw.calib.data.problem import Problem
         from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
-        from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, make_method, search_of
+        from deal_hw.calib.pipeline.methods import (
+            CLOSED_LOOP_METHODS,
+            ENGINE_SEARCHES,
+            SEARCHING,
+            make_method,
+            search_of,
+        )
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:
         raise MissingExtraError(str(err.name), "calib") from err
@@ -331,8 +350,15 @@ def calibrate_episodes(
         known_std=known_std,
         smoothing_s=SMOOTHING_S if smoothing_s is None else smoothing_s,
         policy=policy,
+        tasks=tasks or InThisProcess(),
     )
+    if engine != "mujoco":
+        from deal_hw.sim.engine.warp_support import choose_engine
+
+        searches = search_of(method) in ENGINE_SEARCHES or method in SEARCHING
+        problem.engine = choose_engine(engine, robot, budget.population, method if not searches else "", say)
     check_delays(problem)
+    check_efforts(problem)
     in_loop = policy is not None and search_of(method) in CLOSED_LOOP_METHODS
     if in_loop:
         from deal_hw.workflows.calibration.starts import chosen_starts
@@ -347,10 +373,10 @@ def calibrate_episodes(
 
     judge = None if held_out is None else lambda *fit, of=held_out: errors(of, *fit).nrmse
     best = BestSoFar(space, judge, say, progress)
-    searcher = make_method(method, refine=budget.refine, thorough=thorough)
+    searcher = make_method(method, refine=budget.refine, thorough=thorough, laws=laws)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
-    with threadpool_limits(1, user_api="blas"):
+    with threadpool_limits(1, user_api="blas"), problem.tasks:
         store = None
         if results is not None:
             identity = run_identity(problem, searcher, budget, rng)

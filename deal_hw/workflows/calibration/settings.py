@@ -29,7 +29,7 @@ from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
 from deal_hw.workflows.calibration.source import Division
 from deal_hw.workflows.kinds import InputKind, Kinds, fitting
-from deal_hw.workflows.options import File, Ratio, Seed, Threads
+from deal_hw.workflows.options import File, Ratio, RayPlace, Seed, Threads
 from deal_hw.workflows.robot import carries_robot
 
 HELDOUT_PART = 0.25
@@ -44,6 +44,10 @@ Triples: TypeAlias = tuple[tuple[str, float, float], ...]
 class CalibrateSettings(Checked):
     """Settings that every calibration has."""
 
+    setups: File | None = None
+    """Which recordings were made with a payload, other gains or another MJCF (YAML;
+    docs/reference/setups.md): all are fitted together. A dataset's own setups.yaml is used by default."""
+
     heldout_window: Annotated[float, Range(1e-3, 600, "s")] = HELDOUT_WINDOW_S
     """Held-out predictions restart from the measured state after this time [s]."""
 
@@ -57,8 +61,8 @@ class CalibrateSettings(Checked):
     mujoco-sysid, random, midpoint, midpoint-linear, and variants of the DEAL paper's Algorithm 1:
     deal-paper-literal, deal-paper-literal-fn, deal-paper-literal-pn, deal-paper-literal-flat, deal-paper-fn,
     deal-paper-pn, deal-paper-flat, deal-paper-replay, deal-paper-energy, deal-paper-mmd; parts of deal:
-    deal-critic, deal-untrained, deal-no-critic; and searches that compare distributions of transitions in
-    closed loop: deal-unaligned, mmd-unaligned, moments-unaligned."""
+    deal-critic, deal-untrained, deal-no-critic; output-error-no-laws; and searches that compare distributions
+    of transitions in closed loop: deal-unaligned, mmd-unaligned, moments-unaligned."""
 
     search: Literal["deal", "eki", "deal-paper"] | None = None
     """The search of default and output-error, by default deal. deal: a critic tells recording and simulators
@@ -113,6 +117,11 @@ class CalibrateSettings(Checked):
     """Checks of recordings that the model does not explain: usual ends them where they take more physics
     steps than the fits; all runs them to their end."""
 
+    laws: bool = True
+    """Where a law that MuJoCo lacks, such as friction that falls with speed, predicts the robot better, take
+    it into the result. Your own simulator needs it then: deal_hw.sim.actuators applies it in a MuJoCo loop.
+    --no-laws keeps to what an MJCF can say; the law is still named."""
+
     refine: bool = True
     """After the search, refine by multiple shooting on the prediction error."""
 
@@ -121,6 +130,18 @@ class CalibrateSettings(Checked):
 
     threads: Threads = None
     """Simulation threads; by default all CPUs."""
+
+    engine: Literal["auto", "mujoco", "warp", "warp-cpu"] = "mujoco"
+    """What simulates the population of a search (--search deal, eki); every fit is by mujoco, in float64.
+    mujoco: all CPUs. warp: MuJoCo Warp on an NVIDIA GPU, in float32, for populations of hundreds and more
+    (extra gpu). auto: warp where there is a GPU, the model can run there and the population is large enough,
+    else mujoco. warp-cpu: MuJoCo Warp without a GPU, about 60 times slower than mujoco, to try it
+    (docs/how-to/gpu.md)."""
+
+    ray: RayPlace = None
+    """Do fits that do not depend on each other in workers of Ray: drawn starts, folds of a cross-validation.
+    local (as many as there are processors), local:N, the HOST:PORT of a cluster of which this machine is a
+    node, or auto for the one that runs here (docs/how-to/cluster.md). Results are the same."""
 
     def __post_init__(self) -> None:
         self._keep(free=_words(self.free), known=_pairs(self.known), range=_triples(self.range))
@@ -211,7 +232,8 @@ class CalibrateSettings(Checked):
         space = space.with_known(dict(self.known))
         for parameter, low, high in cast(Triples, self.range):
             space = space.with_range(parameter, low, high)
-        if not len(space):
+        # An unknown payload of a set-up is one more parameter.
+        if not len(space) and self.setups is None:
             raise ConfigurationError(
                 "every parameter is known, so there is nothing to search; remove one from --known"
             )

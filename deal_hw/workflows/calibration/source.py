@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.setups import Setups
 
 Named = tuple[str, Trajectory]
 """A recording with the name that messages give it."""
@@ -51,6 +52,7 @@ class Source:
         balance: Makes the policy that balances the robot in advised motions; None: it stands by itself.
         name: Name under which `deal-hw collect` records this robot; "" if it cannot.
         policy: The policy that moved the robot all the time, if the method needs it.
+        setups: Which recordings were made with a change of the robot; None: all with the model itself.
     """
 
     robot: RobotModel
@@ -66,3 +68,4 @@ class Source:
     balance: Callable[[], Behaviour] | None = None
     name: str = ""
     policy: PopulationPolicy | None = None
+    setups: Setups | None = None

@@ -18,16 +18,19 @@ from deal_hw.motions.behaviours import Behaviour, HoldBehaviour, PolicyBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
 from deal_hw.motions.excitation.level import with_excitation_level
 from deal_hw.motions.joint_targets import make_targets
+from deal_hw.motions.obstacle import BLIND, parse_obstacle
 from deal_hw.motions.planned_end import PlannedEnd
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.motions.velocity import (
     BoundedSource,
+    HeldHeading,
     SlowedVelocity,
     VelocitySource,
+    check_fast,
     limited_axes,
     make_source,
 )
-from deal_hw.policy import IMPORTED, VERDICT, Policy, PolicySpec
+from deal_hw.policy import CLIMBED, IMPORTED, VERDICT, Policy, PolicySpec
 from deal_hw.schema import OPEN, from_values, plain
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.running.view import RunView
@@ -66,6 +69,9 @@ class RunPlan:
         :func:`deal_hw.motions.joint_targets.make_targets`.
         velocity: Source of a walking policy's requested velocity; see
         :func:`deal_hw.motions.velocity.make_source`.
+        hold_heading: Whether the requested turn is corrected by the robot's inertial sensor.
+        obstacle: A platform ahead, as the operator says it; see
+        :func:`deal_hw.motions.obstacle.parse_obstacle`.
         stand: Whether to stand up first and to lie down at the end; not counted in ``seconds``.
         posture: Durations of standing up and lying down.
         robot_settings: The driver's own settings.
@@ -96,6 +102,8 @@ class RunPlan:
     wire: WireOptions = field(default_factory=WireOptions)
     target: str = ""
     velocity: str = "0,0,0"
+    hold_heading: bool = False
+    obstacle: str = BLIND
     stand: bool = False
     posture: PostureConfig = field(default_factory=PostureConfig)
     robot_settings: dict[str, Any] = field(default_factory=dict)
@@ -174,7 +182,10 @@ def check_plan(plan: RunPlan, description: RobotDescription, view: RunView | Non
                 _ask(Path(plan.policy), policy.spec, view or RunView())
             elif verdict == "amber" and not plan.trust_calibration and view is not None:
                 view.warn(_amber(Path(plan.policy), policy.spec))
+            _ask_height(plan, policy.spec, view or RunView())
             walks = plan.motion not in ("excite", "rich")
+            if walks:
+                check_fast(plan.velocity_source(), policy.spec.command_range)
             limited = limited_axes(plan.velocity_source(), policy.spec.command_range) if walks else []
             if limited and view is not None:
                 view.warn(
@@ -222,9 +233,34 @@ def _ask(policy: Path, spec: PolicySpec, view: RunView) -> None:
             "predicts the robot worse than the original one, or no held-out data show that it is better"
         )
         do = "calibrate again and retrain"
+    _confirm(view, seen, do, "run it with --trust-calibration")
+
+
+def _ask_height(plan: RunPlan, spec: PolicySpec, view: RunView) -> None:
+    """Ask whether to climb a platform that is higher than those of the policy's training.
+
+    Raises:
+        PolicyError: The answer is no, or no operator can answer.
+    """
+    climbed, (_, height) = spec.training.get(CLIMBED), parse_obstacle(plan.obstacle)
+    if not isinstance(climbed, int | float) or height <= climbed + 1e-9:
+        return
+    seen = (
+        f"--obstacle {plan.obstacle} is a platform of {height:g} m, and the highest that most robots climbed "
+        f"in the training of {Path(plan.policy).name} is {climbed:g} m: the robot may fall"
+    )
+    _confirm(view, seen, f"use a platform of at most {climbed:g} m", "answer the question in a terminal")
+
+
+def _confirm(view: RunView, seen: str, do: str, otherwise: str) -> None:
+    """Ask whether to run all the same.
+
+    Raises:
+        PolicyError: The answer is no, or no operator can answer.
+    """
     answer = view.confirm(f"warning: {seen}", "run it all the same?")
     if answer is None:
-        raise PolicyError(f"{seen}; {do}, or run it with --trust-calibration")
+        raise PolicyError(f"{seen}; {do}, or {otherwise}")
     if not answer:
         raise PolicyError(f"not run; {do}")
 
@@ -258,11 +294,12 @@ def make_behaviour(
         end: The planned end of a robot that lies down.
 
     Raises:
-        PolicyError: The policy is missing or cannot run.
+        PolicyError: The policy is missing or cannot run, or a flat one is told of a platform.
         PolicyMismatchError: It was made for another robot.
         DatasetError: The recording cannot be replayed.
     """
-    source = SlowedVelocity(source or plan.velocity_source())
+    source = source or plan.velocity_source()
+    source = SlowedVelocity(HeldHeading(source) if plan.hold_heading else source)
     inner = _inner_behaviour(plan, description, source, lambda: _loaded(plan, load))
     if not plan.stand:
         return inner
@@ -294,7 +331,14 @@ def _inner_behaviour(
         config = dataclasses.replace(config, duration_s=plan.seconds)
         balance = PolicyBehaviour(policy(), description) if config.balance_s > 0 else None
         return RichBehaviour(description, balance, config, plan.seed)
-    return PolicyBehaviour(policy(), description, source, make_targets(plan.target, description).at)
+    targets, obstacle = make_targets(plan.target, description), parse_obstacle(plan.obstacle)
+    found = PolicyBehaviour(policy(), description, source, targets.at, obstacle)
+    if any(obstacle) and not found.follows_obstacle:
+        raise PolicyError(
+            f"{Path(plan.policy).stem} does not observe a platform, so --obstacle {plan.obstacle} has no "
+            "effect: it was trained on flat ground; give a policy that climbs, or leave out --obstacle"
+        )
+    return found
 
 
 def find_excitation(plan: RunPlan, description: RobotDescription) -> ExcitationPlan:

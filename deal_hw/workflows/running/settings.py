@@ -47,6 +47,13 @@ class LegOptions(StandOptions):
     """Requested velocity of a walking policy: ahead, left, turn, such as 0.3,0,0 [m/s, m/s, rad/s]; or remote
     (the robot's own), keyboard, or a CSV file with the columns time_s,x,y,yaw."""
 
+    hold_heading: bool = False
+    """Correct the requested turn by the robot's inertial sensor, so that the robot keeps its heading."""
+
+    obstacle: str = "0,0"
+    """A platform ahead, for a policy that observes one: its distance from the base and its height when the
+    policy begins, such as 1,0.15 [m, m]; 0,0 says nothing."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LinkOptions(Checked):
@@ -266,8 +273,10 @@ def plan_options(
     stands = _stands(description) if legs.stand is None else legs.stand
     if isinstance(legs, LegOptions):
         if not walks:
-            refuse(given(legs, LegOptions(), ["velocity"]), "no walking policy runs here")
-        options["velocity"] = legs.velocity
+            names = ["velocity", "hold_heading", "obstacle"]
+            refuse(given(legs, LegOptions(), names), "no walking policy runs here")
+        options["velocity"], options["obstacle"] = legs.velocity, legs.obstacle
+        options["hold_heading"] = legs.hold_heading
     if isinstance(link, Go2LinkOptions) and link.simulator != "none":
         refuse(
             [*given(link, Go2LinkOptions(), ["state_check"]), *given(legs, StandOptions(), ["hand_back"])],

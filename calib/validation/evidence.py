@@ -1,0 +1,184 @@
+"""Evidence on the causes of a residual: regressions on signatures beside the parameters.
+
+Fitted on some windows, they predict the others. Their statistic is the held-out deviance: twice the logarithm
+of the likelihood ratio, with an estimated noise level.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import ended_at_bound
+from deal_hw.calib.fit.refinement import Refined
+from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.validation.cause_words import SearchedKinds
+from deal_hw.calib.validation.cross_validation import fold_numbers
+from deal_hw.calib.validation.signatures import Signature, SignatureResponse, answers, signatures
+from deal_hw.types import FloatArray
+
+FOLDS = 4
+"""Number of folds over the windows."""
+
+ROUNDS = 2
+"""Stretches of consecutive windows that each fold leaves out."""
+
+PARAMETER_PRIOR = 0.5
+"""Spread of parameters in the regression, as a share of their range [-]."""
+
+LATENCY_PRIOR_S = 0.02
+"""Spread of the latency in the regression [s]."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence for a diagnosis; regressions on it leave the start states free.
+
+    Attributes:
+        rows: Linearised residuals, per episode.
+        prior: Information on the parameters and the latency, (P,).
+        found: Signatures of the causes.
+        period_s: Sampling period [s].
+        answers: Responses of the windows to commands, per episode; empty if unknown, or if each command's
+            delay was an unknown of the fit.
+        time_s: Time of each sample in its recording, per episode (W, H) [s].
+        names: Names of the recordings, per episode.
+        searched: What the fit searched.
+    """
+
+    rows: Sequence[WindowRows]
+    prior: FloatArray
+    found: Sequence[Signature]
+    period_s: float
+    answers: Sequence[SignatureResponse] = ()
+    time_s: Sequence[FloatArray] = ()
+    names: Sequence[str] = ()
+    searched: SearchedKinds = field(default_factory=SearchedKinds)
+
+    @cached_property
+    def _following(self) -> list[FloatArray]:
+        return [rows.following for rows in self.rows]
+
+    @cached_property
+    def _rest(self) -> list[FloatArray]:
+        return [rows.rest for rows in self.rows]
+
+    @cached_property
+    def _columns(self) -> dict[int, list[FloatArray]]:
+        """Each signature's columns without what start states explain, by its identity."""
+
+        def left(rows: WindowRows, x: FloatArray) -> FloatArray:
+            # Rows of the start states' prior are 0.
+            return rows.without_starts(np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0))))
+
+        return {id(s): list(map(left, self.rows, s.columns)) for s in self.found}
+
+    def _design(self, taken: Sequence[Signature]) -> list[FloatArray]:
+        """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
+        columns = [self._columns[id(s)] for s in taken]
+        return [np.concatenate(parts, axis=2) for parts in zip(self._following, *columns, strict=True)]
+
+    def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return each window's normal matrix, (W, n, n), and vector, (W, n), squares, (W,), and the prior."""
+        design = self._design(taken)
+        matrix = np.concatenate([np.einsum("wri,wrj->wij", x, x) for x in design])
+        vector = np.concatenate(
+            [np.einsum("wri,wr->wi", x, r) for x, r in zip(design, self._rest, strict=True)]
+        )
+        squares = np.concatenate([np.sum(r**2, axis=1) for r in self._rest])
+        own = np.einsum("wii->i", matrix)
+        prior = np.append(self.prior, 1e-6 * own[len(self.prior) :] + 1e-12)
+        return matrix, vector, squares, prior
+
+    def coefficients(self, taken: Sequence[Signature]) -> FloatArray:
+        """Return the regression's coefficients on all windows, parameters first, (P + n,)."""
+        matrix, vector, _, prior = self._normal(taken)
+        return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
+
+    def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
+        """Return the residual after the regression, (W, R) per episode."""
+        found = self.coefficients(taken)
+        return [r - x @ found for x, r in zip(self._design(taken), self._rest, strict=True)]
+
+    def without(self, taken: Sequence[Signature]) -> list[WindowRows]:
+        """Return the rows without what signatures explain beside the parameters; start states stay free."""
+        found = self.coefficients(taken)[len(self.prior) :]
+        left = []
+        for e, rows in enumerate(self.rows):
+            residual, first = rows.residual.copy(), 0
+            for signature in taken:
+                columns = signature.columns[e]
+                n = columns.shape[2]
+                residual[:, : columns.shape[1]] -= columns @ found[first : first + n]
+                first += n
+            left.append(dataclasses.replace(rows, residual=residual))
+        return left
+
+    @cached_property
+    def count(self) -> int:
+        """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
+        measured = sum(int(np.count_nonzero(r)) for r in self._rest)
+        return max(measured - sum(len(r.start) * int(r.start.shape[2]) for r in self.rows), 1)
+
+    def held_out(self, taken: Sequence[Signature]) -> float:
+        """Return the total cost of each fold's windows with the regression fitted to the others."""
+        matrix, vector, squares, prior = self._normal(taken)
+        fold = fold_numbers(len(squares), FOLDS, ROUNDS)
+        cost = 0.0
+        for k in range(FOLDS):
+            mine, others = fold == k, fold != k
+            found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
+            each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
+            cost += float(each[mine].sum())
+        return cost
+
+    def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
+        """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
+        return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
+
+
+def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Evidence:
+    """Return the evidence for :func:`deal_hw.calib.validation.diagnosis.diagnose`.
+
+    Args:
+        problem: The problem.
+        refined: Its fit, with linearised residuals.
+        answered: Whether to simulate the answers to commands, which only a delay that varies needs.
+    """
+    space, data = problem.space, refined.shooting.data
+    # A parameter at the end of its range cannot explain more.
+    free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
+    episodes = [problem.episodes[d.episode] for d in data]
+    return Evidence(
+        rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
+        prior=parameter_prior(problem),
+        found=signatures(problem, refined),
+        answers=answers(problem, refined) if answered and problem.command_delays is None else (),
+        period_s=problem.episodes[0].period_s,
+        time_s=[
+            np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
+            for e, d in zip(episodes, data, strict=True)
+        ],
+        names=[e.name for e in episodes],
+        searched=SearchedKinds.of(problem, refined.theta),
+    )
+
+
+def parameter_prior(problem: Problem) -> FloatArray:
+    """Return a regression's information on the parameters and the latency before any data, (K + 1,)."""
+    width = np.append(PARAMETER_PRIOR * problem.space.width, LATENCY_PRIOR_S)
+    return np.asarray(1 / width**2)
+
+
+def groups_of(found: Sequence[Signature]) -> list[list[Signature]]:
+    """Return the units of the selection: a cause at all joints, or the mass of one body."""
+    causes = dict.fromkeys(s.cause for s in found if s.cause != "mass")
+    return [
+        *([s for s in found if s.cause == cause] for cause in causes),
+        *([s] for s in found if s.cause == "mass"),
+    ]

@@ -1,0 +1,276 @@
+"""Which explanation of a residual predicts motion that it was not fitted to, and by how much.
+
+All explanations are screened by their linearised effect around the fit without them, fitted on some windows
+and compared on the others. Those that gain most are fitted as models of their own, to a part of the
+recordings, and compared by what they predict of the rest. The best one is the robot if only noise is left.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2
+from deal_hw.calib.fit.refinement import Refined
+from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.validation.cause_words import Diagnosis
+from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
+from deal_hw.calib.validation.explanations import (
+    EXPLANATIONS,
+    PLAY,
+    SHAPES,
+    Explanation,
+    off_value,
+    tried_value,
+)
+from deal_hw.calib.validation.signatures import Signature, whitened_changes
+from deal_hw.calib.validation.wider_models import WiderFit, fit_wider, gain_of, wider_cost
+from deal_hw.calibration import listed
+from deal_hw.findings import Finding
+from deal_hw.parameters import Parameter
+from deal_hw.types import FloatArray
+
+Allows = Callable[[str, float], bool]
+"""Whether a check, by name, may run that takes at most so many physics steps."""
+
+RIVAL = 0.5
+"""Least screened gain of an explanation that is fitted, over that of the best cause of all [-]."""
+
+DECISIVE = 0.5
+"""Share explained from which other causes are searched only after its repair [-]."""
+
+FAR = 25.0
+"""Chi2 above which effects around a fit say nothing of other laws than play: a residual of five times the
+noise. Local fits of three real robots have 75 to 160. On two of them another law comes first there than
+around fits of predictions, and on the SO-101 it is the latter's that predicts held-out motion better."""
+
+LEAST_PLAY = 0.2
+"""Least play of a named joint, as a share of the widest one [-]."""
+
+SURE = 5.0
+"""Least value of a named parameter, in its standard deviations [-]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """An explanation that was screened, and fitted where that promised something.
+
+    Attributes:
+        explanation: The explanation.
+        of: The recordings, without it.
+        screened: Gain in held-out deviance of its linearised effect [-].
+        wider: Its fit; None where it was not fitted, or could not be.
+    """
+
+    explanation: Explanation
+    of: Problem
+    screened: float
+    wider: WiderFit | None
+
+    def to_json(self, found: Explained | None) -> dict[str, Any]:
+        """Return plain JSON values, with what it explains, if anything."""
+        row: dict[str, Any] = {"explanation": self.explanation.name, "screened": self.screened}
+        if self.wider is not None:
+            names = (p.name for p in self.wider.more)
+            row["values"] = dict(zip(names, map(float, self.wider.found), strict=True))
+            row["held_out_chi2"] = self.wider.prediction.chi2
+        if found is not None:
+            row |= {"held_out_before": found.before, "share": found.diagnosis.share}
+            row["deviance"] = found.diagnosis.deviance
+        return row
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """An explanation that predicts better than the model does without it.
+
+    Attributes:
+        explanation: The explanation.
+        diagnosis: It as the cause of the residual.
+        problem: The recordings, with its parameters that are sure.
+        theta: The fit's values of these parameters.
+        latency_s: Its latency [s].
+        chi2: Mean squared residual over the noise variance, of motion that was not fitted.
+        before: The same without the explanation.
+    """
+
+    explanation: Explanation
+    diagnosis: Diagnosis
+    problem: Problem
+    theta: FloatArray
+    latency_s: float
+    chi2: float
+    before: float
+
+    @property
+    def explains(self) -> bool:
+        """Whether it leaves only noise of motion that was not fitted, and less than half of the residual."""
+        return self.chi2 < MISMATCH_CHI2 and self.diagnosis.share >= DECISIVE
+
+    @property
+    def added(self) -> tuple[str, ...]:
+        """Names of its parameters in :attr:`problem`."""
+        own = len(self.diagnosis.shift) - 1
+        return tuple(self.problem.space.names[own:])
+
+
+def refused(allows: Allows, names: Sequence[str]) -> Allows:
+    """Return what allows no check of these names, and the others as ``allows`` does."""
+    return lambda name, steps: name not in names and allows(name, steps)
+
+
+def applicable(problem: Problem) -> dict[Explanation, list[Parameter]]:
+    """Return the explanations that a robot can have, with their parameters: for fixed bases, with noise."""
+    if problem.robot.base is not None or problem.noise_free:
+        return {}
+    return {each: more for each in EXPLANATIONS if (more := each.parameters(problem))}
+
+
+def try_explanations(
+    problem: Problem,
+    refined: Refined,
+    allows: Allows,
+    given: Sequence[Tried] = (),
+    known: Callable[[], Evidence] | None = None,
+) -> tuple[Tried, ...]:
+    """Screen all explanations of a fit's residual, and fit those that promise most.
+
+    Play is always fitted: its effect around a fit without it says little, as nothing moves within it. Around
+    a poor fit that is so for all of them, so no other is fitted then.
+
+    Args:
+        problem: The problem.
+        refined: Its fit without them, with linearised residuals.
+        allows: Which fits may be made.
+        given: Earlier results; those of the same problem are kept.
+        known: Returns the evidence on the fit, where somebody else needs it, too.
+    """
+    if any(one.of is problem for one in given):
+        return tuple(one for one in given if one.of is problem)
+    can = applicable(problem)
+    if refined.chi2 > FAR:
+        can = {each: more for each, more in can.items() if each is PLAY}
+        gains, enough = {PLAY: 0.0}, np.inf
+    elif can:
+        gains, enough = _gains(problem, refined, can, known)
+    found = []
+    for each, more in can.items():
+        fitted = each is PLAY or gains[each] > enough
+        fitted = fitted and allows(each.name, wider_cost(problem, True, len(more)))
+        found.append(Tried(each, problem, gains[each], fit_wider(problem, more) if fitted else None))
+    return tuple(found)
+
+
+def _gains(
+    problem: Problem,
+    refined: Refined,
+    can: Mapping[Explanation, Sequence[Parameter]],
+    known: Callable[[], Evidence] | None,
+) -> tuple[dict[Explanation, float], float]:
+    """Return the screened gain of each explanation, and that from which one is fitted."""
+    seen = evidence(problem, refined, answered=False) if known is None else known()
+    causes = [seen.gain([], group) for group in groups_of(seen.found)]
+    at = problem, refined.theta, refined.latency_s, refined.shooting, refined.point
+    gains = screened_gains(seen, {each: screened(*at, each, more) for each, more in can.items()})
+    return gains, max(EVIDENCE, RIVAL * max(*causes, *gains.values()))
+
+
+def screened_gains(known: Evidence, laws: Mapping[Explanation, Signature]) -> dict[Explanation, float]:
+    """Return the held-out deviance that each explanation gains by its linearised effect alone."""
+    seen = dataclasses.replace(known, found=list(laws.values()))
+    return {each: seen.gain([], [law]) for each, law in laws.items()}
+
+
+def screened(
+    problem: Problem,
+    theta: FloatArray,
+    latency_s: float,
+    shooting: Shooting,
+    point: Point,
+    found: Explanation,
+    more: Sequence[Parameter],
+) -> Signature:
+    """Return what an explanation's parameters do to the predictions of a fit without it.
+
+    Each goes from no effect to its first value; those without an effect of their own stay.
+
+    Args:
+        problem: The problem, without the explanation.
+        theta: Values of the fit, (K,).
+        latency_s: Its latency [s].
+        shooting: Its windows.
+        point: Its start states.
+        found: The explanation.
+        more: Its parameters.
+    """
+    wide = problem.with_more(more)
+    sizes = [k for k, p in enumerate(more) if p.kind not in SHAPES]
+    K, off = len(theta), np.array([off_value(p) for p in more])
+    members = np.repeat(np.append(theta, off)[None], 1 + len(sizes), axis=0)
+    for row, k in enumerate(sizes):
+        members[1 + row, K + k] = tried_value(more[k])
+    late = np.full(len(members), latency_s)
+    columns = []
+    for e, data in enumerate(shooting.data):
+        seen = wide.predict(members, late, data, point.position[e], point.velocity[e]).observed
+        columns.append(np.moveaxis(whitened_changes(seen, data), 0, -1))
+    return Signature(found.cause, found.name, tuple(columns))
+
+
+def explained(problem: Problem, refined: Refined, tried: Sequence[Tried]) -> list[Explained]:
+    """Return the explanations that predict unseen motion better than the model does without, best first.
+
+    The fit without them, ``refined``, has used all recordings; each of them saw a part.
+    """
+    found = [one for each in tried if (one := _explained(problem, refined, each)) is not None]
+    return sorted(found, key=lambda one: -one.diagnosis.deviance)
+
+
+def rivals(found: Sequence[Explained]) -> list[Explained]:
+    """Return the best explanation, and those that predict about as well: no chance tells them apart."""
+    return [one for one in found if found[0].diagnosis.deviance - one.diagnosis.deviance < EVIDENCE]
+
+
+def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | None:
+    wide, of = tried.wider, tried.explanation
+    gained = None if wide is None else gain_of(wide, refined)
+    if wide is None or gained is None:
+        return None
+    order = _named(wide, of)
+    if not order:
+        return None
+    named = [wide.more[k] for k in order]
+    elements = tuple(dict.fromkeys(e for p in named for e in p.elements))
+    if of is PLAY:
+        sizes = listed(
+            [f"{wide.found[k]:.2g} {wide.more[k].unit} at {wide.more[k].elements[0]}" for k in order]
+        )
+    else:
+        sizes = listed([f"{wide.more[k].name} = {wide.found[k]:.2g} {wide.more[k].unit}" for k in order])
+    seen = (
+        f"With {of.name} ({sizes}) the model predicts motion that it was not fitted to with chi2 "
+        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: {of.cause}."
+    )
+    alarm = Finding.alarm(seen, of.means, of.do.replace("{}", listed(elements)))
+    cause = Diagnosis.of(of.cause, gained.share, gained.deviance, elements, alarm, wide.shift_of(refined))
+    theta = np.concatenate([wide.fit.theta[: len(problem.space)], wide.found[order]])
+    return Explained(
+        of, cause, problem.with_more(named), theta, wide.fit.latency_s, wide.prediction.chi2, gained.before
+    )
+
+
+def _named(wide: WiderFit, of: Explanation) -> list[int]:
+    """Return the parameters that are sure, largest first, then those that shape them."""
+    if of is PLAY:
+        found = wide.found
+        return [int(k) for k in np.argsort(-found) if found[k] >= LEAST_PLAY * found.max() > 0]
+    sure = np.where([p.kind in SHAPES for p in wide.more], 0.0, np.abs(wide.significance()))
+    sizes = [int(k) for k in np.argsort(-sure) if sure[k] > SURE]
+    places = {e for k in sizes for e in wide.more[k].elements}
+    shapes = [k for k, p in enumerate(wide.more) if p.kind in SHAPES and places & set(p.elements)]
+    return sizes + shapes

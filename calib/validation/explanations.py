@@ -1,0 +1,217 @@
+"""Laws and quantities that a model may lack, as candidates that explain a residual.
+
+Each candidate is a model with more parameters. It is fitted to a part of the recordings and predicts the rest
+(:mod:`deal_hw.calib.validation.wider_models`). Candidates are compared by that prediction alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.validation.signatures import Cause
+from deal_hw.calib.validation.wider_models import MOST_FORCE, motion
+from deal_hw.parameters import Parameter, Scale
+from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.parameters.laws import STRIBECK_SPEED
+
+MOST_PLAY = 0.5
+"""Widest play, as a share of the commands' span [-]."""
+
+MOST_LAG_S = 0.1
+"""Longest time constant of a drive that is tried [s]. A hobby servo's filter is below 0.05 s."""
+
+FIRST_LAG_S = 0.005
+"""Time constant from which its fit begins [s]."""
+
+MOST_LOAD = 0.5
+"""Largest friction a torque that is tried [-]. Identified servos have up to 0.31 (BAM, bam/params)."""
+
+FIRST_LOAD = 0.02
+"""Friction a torque from which its fit begins [-]."""
+
+MOST_ASYMMETRY = 0.5
+"""Largest share by which a motor does more to one side that is tried [-]."""
+
+FIRST_SHARE = 0.3
+"""Further friction at rest from which a fit begins, as a share of the friction in motion [-]."""
+
+SPEEDS = (0.01, 1.0)
+"""Least and largest Stribeck speed that is tried, in rms speeds of the joint [-]. A faster one cannot be told
+from less damping."""
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """A law or quantity that the model lacks and the robot may have.
+
+    Attributes:
+        name: What it is.
+        cause: The cause that it stands for.
+        parameters: Its parameters, those of a size first; none where it does not apply.
+        means: What it means.
+        do: What to do about it, with {} for the joints or bodies.
+        taken: What to do where the result has it, with {} for the names of its parameters there.
+    """
+
+    name: str
+    cause: Cause
+    parameters: Callable[[Problem], list[Parameter]]
+    means: str
+    do: str
+    taken: str
+
+
+def _play(problem: Problem) -> list[Parameter]:
+    if problem.robot.description.actuation != "position" or _searched(problem, "servo_play"):
+        return []
+    span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
+    return [
+        _parameter(problem, "servo_play", name, 0.0, 0.0, MOST_PLAY * float(most))
+        for name, most in zip(problem.robot.actuator_names, span, strict=True)
+        if most > 0
+    ]
+
+
+def _stribeck(problem: Problem) -> list[Parameter]:
+    if _searched(problem, "dof_friction_stribeck"):
+        return []
+    model, found, speeds = problem.robot.model, [], []
+    for name, speed, push in zip(problem.robot.description.joint_names, *motion(problem), strict=True):
+        coulomb = float(model.dof_frictionloss[int(model.joint(name).dofadr[0])])
+        if coulomb <= 0 or speed <= 0:
+            # Without dry friction in the model that comes first.
+            continue
+        most = max(MOST_FORCE * push, MOST_FORCE * coulomb)
+        found.append(
+            _parameter(problem, "dof_friction_stribeck", name, FIRST_SHARE * coulomb, 0.0, float(most))
+        )
+        first = float(np.clip(STRIBECK_SPEED, 2 * SPEEDS[0] * speed, 0.5 * SPEEDS[1] * speed))
+        ends = SPEEDS[0] * float(speed), SPEEDS[1] * float(speed)
+        speeds.append(_parameter(problem, "dof_stribeck_speed", name, first, *ends, scale="log"))
+    return [*found, *speeds]
+
+
+def _load(problem: Problem) -> list[Parameter]:
+    if any(_searched(problem, kind) for kind in ("dof_friction_load", "dof_friction_motor")):
+        return []
+    driven = problem.robot.description.actuated
+    return [_parameter(problem, "dof_friction_load", name, FIRST_LOAD, 0.0, MOST_LOAD) for name in driven]
+
+
+def _lag(problem: Problem) -> list[Parameter]:
+    if _searched(problem, "command_lag"):
+        return []
+    filters, names = problem.robot.filters, problem.robot.actuator_names
+    # A filter of the MJCF acts already: then the question is whether its time constant is another.
+    own = np.zeros(len(names)) if filters is None else filters.lag_s
+    return [
+        _parameter(
+            problem, "command_lag", name, float(lag) or FIRST_LAG_S, 0.0, max(MOST_LAG_S, 2 * float(lag))
+        )
+        for name, lag in zip(names, own, strict=True)
+    ]
+
+
+def _motor(problem: Problem) -> list[Parameter]:
+    if problem.robot.description.actuation != "motor" or _searched(problem, "command_asymmetry"):
+        return []
+    names = problem.robot.actuator_names
+    return [
+        _parameter(problem, "command_asymmetry", name, 0.0, -MOST_ASYMMETRY, MOST_ASYMMETRY) for name in names
+    ]
+
+
+PLAY = Explanation(
+    "play in the gears",
+    "backlash",
+    _play,
+    "Motor and joint do not move as one where the motion or the load turns round. The encoder may be on "
+    "either side.",
+    "Repair the gear of {}, or free servo_play there (--parameters).",
+    "Repair the gear. Until then use this result: it has the play as {}.",
+)
+
+EXPLANATIONS: Sequence[Explanation] = (
+    PLAY,
+    Explanation(
+        "friction that falls with speed",
+        "friction",
+        _stribeck,
+        "Dry friction is larger at rest than in motion (Stribeck). That of MuJoCo is constant.",
+        "Free dof_friction_stribeck and dof_stribeck_speed of {} (--parameters).",
+        "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "friction that grows with load",
+        "friction",
+        _load,
+        "Dry friction grows with the torque that the gear transmits. That of MuJoCo is constant.",
+        "Free dof_friction_load of {} (--parameters).",
+        "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "drives that lag",
+        "drive",
+        _lag,
+        "The drive follows its command with a first-order lag, as one with a filter or an inductance does.",
+        "Free command_lag of {} (--parameters).",
+        "Use this result: it has the lag as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "motors that do more to one side",
+        "drive",
+        _motor,
+        "The same command has another effect to either side.",
+        "Check the motor of {} and its drive, or free command_asymmetry there (--parameters).",
+        "Check the motor and its drive. Until then use this result: it has the difference as {}.",
+    ),
+)
+"""Candidates, those with the fewest parameters first."""
+
+
+TRIED = 0.02
+"""Value whose effect is simulated where a fit begins at 0, as a share of the largest one [-]."""
+
+SHAPES = ("dof_stribeck_speed",)
+"""Kinds without an effect of their own: they shape that of another parameter."""
+
+
+def off_value(p: Parameter) -> float:
+    """Return the value at which a parameter has no effect."""
+    return p.nominal if p.kind in SHAPES else 0.0
+
+
+def tried_value(p: Parameter) -> float:
+    """Return a value with some effect."""
+    return p.nominal or TRIED * p.high
+
+
+def _searched(problem: Problem, kind: str) -> bool:
+    return any(p.kind == kind for p in problem.space.parameters)
+
+
+def _parameter(
+    problem: Problem,
+    kind: str,
+    element: str,
+    nominal: float,
+    low: float,
+    high: float,
+    scale: Scale = "linear",
+) -> Parameter:
+    of, model = KIND_TABLE[kind], problem.robot.model
+    index = getattr(model, of.element)(element).id
+    return Parameter(
+        name=f"{element}.{of.quantity}",
+        kind=kind,
+        elements=(element,),
+        unit=of.unit_of(model, index),
+        nominal=nominal,
+        low=low,
+        high=high,
+        scale=scale,
+    )
