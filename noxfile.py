@@ -17,7 +17,7 @@ def base(session: nox.Session) -> None:
     session.install(
         "--constraint", "constraints-3.10.txt", "--editable", ".[robot,sim,keys,lerobot,dds,testing]"
     )
-    others = ("gymnasium", "hypothesis", "onnx", "pillow", "pycdr2", "pytest-xdist")
+    others = ("gymnasium", "hypothesis", "onnx", "pillow", "pycdr2", "pytest-timeout", "pytest-xdist")
     session.install("--constraint", "constraints-3.10.txt", *others)
     folders = ("contracts", "control", "data", "drivers", "sim")
     session.run("pytest", "-n", "2", *(f"tests/{name}" for name in folders), *session.posargs)

@@ -261,14 +261,15 @@ class ServoArm(PolledRobot[ServoBus]):
             FrameError: Their answers are corrupt.
         """
         address, size = self._family.block
-        failures = 0
+        failures, patient_ns = 0, self._clock.now_ns() + _PATIENCE_NS
         while True:
             try:
                 self._poller.asked_ns = self._bus.ask(self._ids, address, size)
                 found = self._bus.take(end_ns)
             except (TransportTimeoutError, FrameError):
                 failures += 1
-                if failures == _MOST_FAILURES or self._clock.now_ns() >= end_ns:
+                now_ns = self._clock.now_ns()
+                if now_ns >= end_ns or (failures >= _MOST_FAILURES and now_ns >= patient_ns):
                     raise
                 continue
             if found is None:

@@ -32,7 +32,8 @@ from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.workflows.running import control_process
 from deal_hw.workflows.running.control_process import _Stopper
 
-pytestmark = pytest.mark.real_time
+# The time limit of a test is a handler of SIGALRM, which these tests set themselves.
+pytestmark = [pytest.mark.real_time, pytest.mark.timeout(0)]
 
 DEFAULT = {
     "end": "HUP INT QUIT TERM PIPE ALRM XCPU USR1 USR2 VTALRM PROF IO PWR STKFLT ABRT TRAP SYS TSTP",

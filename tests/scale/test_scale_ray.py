@@ -1,110 +1,149 @@
-"""Tasks in real workers of Ray on this machine: results, processes that are killed, what listens."""
+"""Tasks in real workers of Ray on this machine: results, processes that are killed, what listens.
+
+Ray runs in a process of its own: where its native part fails, as on a busy computer, it ends the process
+that it runs in, which would be the worker of pytest.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
 import sys
-from collections.abc import Iterator
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed (extra scale)"),
+]
+
+LONGEST_S = 240
+PROGRAM = r"""
+import json, os, signal, sys
+from functools import partial
+from pathlib import Path
+import psutil
 from deal_hw.errors import ConfigurationError, TaskLostError
 from deal_hw.scale.where import task_map
-from deal_hw.task_map import InThisProcess, TaskMap
+from deal_hw.task_map import InThisProcess
 
-# Not imported: tests are collected without it.
-pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed (extra scale)")
+folder, found = Path.cwd(), {}
 
+def power(shared, spec):
+    return [spec, spec ** len(shared)]
 
-@pytest.fixture(scope="module")
-def two() -> Iterator[TaskMap]:
-    """Two workers, which all tests of this file share: their start takes some seconds of processor."""
-    with task_map("local:2") as tasks:
-        yield tasks
+def seen(spec):
+    return [sys.argv[1:], os.getcwd(), os.environ["OMP_NUM_THREADS"], os.environ["OPENBLAS_NUM_THREADS"]]
 
+def fails(spec):
+    raise ConfigurationError(f"number {spec}")
 
-def power(shared: list[int], spec: int) -> tuple[int, int]:
-    """A task with a value that all share."""
-    return spec, spec ** len(shared)
+def dies_once(spec):
+    mark = folder / str(spec)
+    if not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 10 * spec
 
+def dies(spec):
+    if spec == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return spec
 
-def test_results_are_those_of_this_process(two: TaskMap) -> None:
-    """In the order of the specifications."""
-    task = partial(power, [0] * 3)
-    assert two.map(task, range(20)) == InThisProcess().map(task, range(20))
-    assert two.map(task, []) == []
-
-
-def test_a_worker_knows_command_line_and_folder_and_has_one_thread(
-    two: TaskMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Relative paths mean the same there; numeric libraries do not take each other's processors."""
-
-    def seen(_: int) -> tuple[list[str], str, str, str]:
-        return sys.argv, os.getcwd(), os.environ["OMP_NUM_THREADS"], os.environ["OPENBLAS_NUM_THREADS"]
-
-    monkeypatch.setattr(sys, "argv", ["deal-hw", "bench", "x"])
-    monkeypatch.chdir(tmp_path)
-    assert two.map(seen, [0]) == [(["deal-hw", "bench", "x"], str(tmp_path), "1", "1")]
-
-
-def test_an_error_of_a_task_is_raised_here(two: TaskMap) -> None:
-    """As its own class, so that it is handled as without workers."""
-
-    def fails(spec: int) -> int:
-        raise ConfigurationError(f"number {spec}")
-
-    with pytest.raises(ConfigurationError, match="number 3"):
-        two.map(fails, [3])
-
-
-@pytest.mark.slow
-def test_a_task_whose_worker_is_killed_is_done_again(two: TaskMap, tmp_path: Path) -> None:
-    """By `kill -9`, as the kernel does where memory ends; the result is the same."""
-
-    def dies_once(spec: int) -> int:
-        mark = tmp_path / str(spec)
-        if not mark.exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return 10 * spec
-
-    assert two.map(dies_once, [1, 2]) == [10, 20]
-
-
-def test_nothing_listens_beyond_this_machine(two: TaskMap) -> None:
-    """Of all processes that were started."""
-    here = psutil.Process()
-    found = [
-        place.laddr.ip for process in (here, *here.children(recursive=True)) for place in _listening(process)
-    ]
-    assert len(found) > 3 and {ip.removeprefix("::ffff:") for ip in found} == {"127.0.0.1"}
-
-
-def _listening(process: psutil.Process) -> list[Any]:
+def raised(function, spec):
     try:
-        return [p for p in process.net_connections("inet") if p.status == psutil.CONN_LISTEN]
+        tasks.map(function, [spec])
+    except Exception as err:
+        return [type(err).__name__, str(err)]
+
+def listening(process):
+    try:
+        return [p.laddr.ip for p in process.net_connections("inet") if p.status == psutil.CONN_LISTEN]
     except psutil.NoSuchProcess:
         return []
 
+with task_map("local:2") as tasks:
+    task = partial(power, [0] * 3)
+    found["results"] = [tasks.map(task, range(20)), InThisProcess().map(task, range(20)), tasks.map(task, [])]
+    found["worker"] = tasks.map(seen, [0])[0]
+    found["raised"] = raised(fails, 3)
+    here = psutil.Process()
+    found["listening"] = [ip for p in (here, *here.children(recursive=True)) for ip in listening(p)]
+    found["died once"] = tasks.map(dies_once, [1, 2])
+    found["lost"] = dict(tasks.completed(dies, [0, 1, 2], lambda spec, why: -spec))
+    found["lost alone"] = raised(dies, 1)
+print(json.dumps(found))
+"""
 
-@pytest.mark.slow
-def test_a_task_that_kills_each_worker_is_lost_and_the_others_are_done(two: TaskMap) -> None:
+
+def run(folder: Path) -> dict[str, Any] | None:
+    """Run the program; None where Ray itself hung or ended it by a signal."""
+    line = [sys.executable, "-c", PROGRAM, "bench", "x"]
+    with subprocess.Popen(
+        line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        try:
+            printed, errors = process.communicate(timeout=LONGEST_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+            return None
+    if process.returncode < 0:
+        return None
+    assert process.returncode == 0, errors
+    found: dict[str, Any] = json.loads(printed.splitlines()[-1])
+    return found
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The folder of the program, and what it found; where Ray itself failed, it is run once more."""
+    for _ in range(2):
+        folder = tmp_path_factory.mktemp("ray")
+        if (result := run(folder)) is not None:
+            return folder, result
+    pytest.fail(f"Ray hung for {LONGEST_S} s or ended its process, twice")
+
+
+def test_results_are_those_of_this_process(found: tuple[Path, dict[str, Any]]) -> None:
+    """In the order of the specifications."""
+    there, here, none = found[1]["results"]
+    assert there == here == [[n, n**3] for n in range(20)]
+    assert none == []
+
+
+def test_a_worker_knows_command_line_and_folder_and_has_one_thread(
+    found: tuple[Path, dict[str, Any]],
+) -> None:
+    """Relative paths mean the same there; numeric libraries do not take each other's processors."""
+    assert found[1]["worker"] == [["bench", "x"], str(found[0]), "1", "1"]
+
+
+def test_an_error_of_a_task_is_raised_here(found: tuple[Path, dict[str, Any]]) -> None:
+    """As its own class, so that it is handled as without workers."""
+    assert found[1]["raised"] == ["ConfigurationError", "number 3"]
+
+
+def test_a_task_whose_worker_is_killed_is_done_again(found: tuple[Path, dict[str, Any]]) -> None:
+    """By `kill -9`, as the kernel does where memory ends; the result is the same."""
+    assert found[1]["died once"] == [10, 20]
+
+
+def test_nothing_listens_beyond_this_machine(found: tuple[Path, dict[str, Any]]) -> None:
+    """Of all processes that were started."""
+    places = found[1]["listening"]
+    assert len(places) > 3 and {ip.removeprefix("::ffff:") for ip in places} == {"127.0.0.1"}
+
+
+def test_a_task_that_kills_each_worker_is_lost_and_the_others_are_done(
+    found: tuple[Path, dict[str, Any]],
+) -> None:
     """After four beginnings; it is one line with its remedy, or what the caller makes of it."""
-
-    def dies(spec: int) -> int:
-        if spec == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return spec
-
-    lost = dict(two.completed(dies, [0, 1, 2], lambda spec, why: -spec))
-    assert lost == {0: 0, 1: -1, 2: 2}
-    with pytest.raises(TaskLostError, match=r"4 times.*enough memory") as caught:
-        two.map(dies, [1])
-    assert "\n" not in str(caught.value)
+    assert found[1]["lost"] == {"0": 0, "1": -1, "2": 2}
+    kind, said = found[1]["lost alone"]
+    assert kind == "TaskLostError" and "4 times" in said and "enough memory" in said and "\n" not in said
