@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from deal_hw.workflows.inspect import inspect as inspect
     from deal_hw.workflows.own_robot.check import RobotCheck as RobotCheck
     from deal_hw.workflows.own_robot.check import check_robot as check_robot
+    from deal_hw.workflows.own_robot.lock import LockedJoints as LockedJoints
+    from deal_hw.workflows.own_robot.lock import lock_joints as lock_joints
     from deal_hw.workflows.own_robot.new import new_robot as new_robot
     from deal_hw.workflows.policy import PolicyReport as PolicyReport
     from deal_hw.workflows.policy import check_policy as check_policy
@@ -62,6 +64,7 @@ _EXPORTS = {
     "workflows.policy": ("import_policy", "check_policy", "PolicyReport"),
     "workflows.replay": ("replay",),
     "workflows.own_robot.check": ("check_robot", "RobotCheck"),
+    "workflows.own_robot.lock": ("lock_joints", "LockedJoints"),
     "workflows.own_robot.new": ("new_robot",),
     "workflows.running.report": ("RunReport",),
     "workflows.running.settings": (

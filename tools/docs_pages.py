@@ -49,7 +49,7 @@ API_NAMES = {
     ),
     "Check and stop a robot": ("doctor", "stop", "StopReport"),
     "Emulate a robot": ("emulate", "EmulatedRobot"),
-    "Describe a robot": ("new_robot", "check_robot", "RobotCheck"),
+    "Describe a robot": ("new_robot", "check_robot", "RobotCheck", "lock_joints", "LockedJoints"),
     "Train and inspect": ("train", "Training", "inspect", "Inspection"),
     "Policies of others": ("import_policy", "check_policy", "PolicyReport"),
 }

@@ -18,6 +18,7 @@ from deal_hw.workflows.own_robot.check import (
     RobotCheck,
     check_robot,
 )
+from deal_hw.workflows.own_robot.lock import LOCK_JOINTS, LockJointsSettings, lock_joints
 from deal_hw.workflows.own_robot.new import (
     NEW_ROBOT,
     NewFromBusSettings,
@@ -35,7 +36,7 @@ class Check(CheckRobotSettings):
     robot: tyro.conf.Positional[Path]
 
 
-_VERBS = {"new": NEW_ROBOT, "check": CHECK_ROBOT}
+_VERBS = {"new": NEW_ROBOT, "check": CHECK_ROBOT, "lock": LOCK_JOINTS}
 
 
 def _table() -> Mapping[str, InputKind]:
@@ -67,7 +68,8 @@ def robot(
     | NewFromLeRobotSettings
     | NewFromBusSettings
     | CheckRobotSettings
-    | CheckBusSettings,
+    | CheckBusSettings
+    | LockJointsSettings,
 ) -> int | RobotCheck:
     """Run the verb.
 
@@ -75,8 +77,8 @@ def robot(
         0, or the findings, whose exit code is 1 if a check failed.
 
     Raises:
-        ConfigurationError: A file cannot be used, robot.yaml and MJCF contradict each other, or the servos
-            are not those of the arm.
+        ConfigurationError: A file cannot be used, robot.yaml and MJCF contradict each other, a joint cannot
+            be locked, or the servos are not those of the arm.
         DealHwError: The port cannot be opened, or its servos do not answer.
     """
     if isinstance(config, NewFromBusSettings):
@@ -87,6 +89,12 @@ def robot(
         found = check_robot(**vars(config))
         print(found.table())
         return found
+    if isinstance(config, LockJointsSettings):
+        locked = lock_joints(**vars(config))
+        print(f"written: {locked.path}; without the joints {', '.join(config.joints)}")
+        if locked.removed:
+            print(f"removed with them: {', '.join(locked.removed)}")
+        return 0
     path = new_robot(**vars(config))
     check = f"deal-hw robot check {path}"
     if isinstance(config, NewRobotSettings):

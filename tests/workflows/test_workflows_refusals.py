@@ -20,6 +20,7 @@ POSITIONAL = ("robot", "episode", "model")
 LINES = {
     "new_robot": ["robot", "new"],
     "check_robot": ["robot", "check"],
+    "lock_joints": ["robot", "lock"],
     "import_policy": ["policy", "import"],
     "check_policy": ["policy", "check"],
 }
@@ -49,6 +50,7 @@ TABLE: list[tuple[str, dict[str, Any], str]] = [
     ("collect", {"robot": "r.yaml", "port": "p", "out": "out"}, "r.yaml cannot be read: there is no such"),
     ("new_robot", {"model": "m.xml"}, "model m.xml does not exist"),
     ("new_robot", {"model": "m.xml", "control_rate": 0.0}, "--control-rate 0.0 Hz: allowed are 0.001 to"),
+    ("lock_joints", {"model": "m.xml", "joints": ["a"]}, "model m.xml does not exist"),
     ("check_robot", {"robot": "r.yaml"}, "r.yaml cannot be read: there is no such file"),
     ("check_policy", {"policy": "none.onnx"}, "no such policy file: none.onnx"),
     ("import_policy", {**IMPORT, "policy": "none.onnx"}, "no such file: none.onnx"),

@@ -167,7 +167,7 @@ def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
     if missing:
         raise ConfigurationError(
             f"joints of the model without a recorded position: {', '.join(missing)}; add them to the column "
-            "map, or remove the <joint> from a copy of the MJCF, which fixes the body where it is"
+            "map, or fix them in a copy of the MJCF: deal-hw robot lock MODEL --joints NAME=VALUE ..."
         )
     return free
 
@@ -182,7 +182,8 @@ def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[st
     if apart:
         raise ConfigurationError(
             f"actuators of the model that drive no joint: {', '.join(apart)}; calibration takes commands of "
-            "joints: remove these actuators from a copy of the MJCF, or let them drive a joint"
+            "joints: let them drive a joint, or fix the joints that they move in a copy of the MJCF, which "
+            "removes them: deal-hw robot lock MODEL --joints NAME=VALUE ..."
         )
     if idle:
         raise ConfigurationError(
