@@ -29,7 +29,7 @@ from deal_hw.calib.validation.explain import (
     try_explanations,
 )
 from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.signatures import Cause, Signature
+from deal_hw.calib.validation.signatures import Cause, Signature, masses
 from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost, zero_parameters
 from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
@@ -75,6 +75,12 @@ BURST_LEFT = 4.0
 ZEROS = "what is 0 in the model"
 """Name of a check."""
 
+MASS = "another mass"
+"""Name of a check."""
+
+LEAST_RISE = 0.01
+"""Least distance of a found mass from the lower end of its range, as a share [-]."""
+
 
 def all_allowed(name: str, steps: float) -> bool:
     """Allow every check."""
@@ -117,7 +123,23 @@ def diagnose(
     wider = [one for one in wider if supported(one.share, refined.chi2)]
     named = {one.code for one in wider}
     found = [one for one in name_causes(known(), refined.chi2) if one.code not in named]
+    found = [one for one in found if one.code != "mass" or weighs(problem, refined, one, allows)]
     return tuple(sorted((*found, *wider), key=lambda f: -f.deviance))
+
+
+def weighs(problem: Problem, refined: Refined, cause: Diagnosis, allows: Allows) -> bool:
+    """Return whether a model with another mass of the named body predicts unseen motion better, too.
+
+    The signature is the effect of 2 % of the mass, and the cause may be far more. A body that keeps less than
+    a fifth of its mass is no body with another mass: its mass takes up something else.
+    """
+    body = next(p for p in masses(problem) if p.elements[0] == cause.subject[0])
+    if not allows(MASS, wider_cost(problem, True, 1)):
+        return True
+    wide = fit_wider(problem, [body])
+    if wide is None or wide.found[0] <= body.low * (1 + LEAST_RISE):
+        return False
+    return gain_of(wide, refined) is not None
 
 
 def supported(share: float, chi2: float) -> bool:

@@ -84,7 +84,7 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
     )
     speed = np.sqrt(np.mean(moved**2, axis=0))
     found: dict[tuple[Cause, str], list[FloatArray]] = {}
-    heavier = _bodies(problem)
+    heavier = masses(problem)
     wide = problem.with_more(heavier)
     for e, data in enumerate(fit.shooting.data):
         x, v = fit.point.position[e], fit.point.velocity[e]
@@ -94,8 +94,8 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
             )
             theta[1:, len(fit.theta) :] *= 1 + HEAVIER * np.eye(len(heavier))
             late = np.full(len(theta), fit.latency_s)
-            masses = wide.predict(theta, late, data, x, v).observed
-            for p, column in zip(heavier, whitened_changes(masses, data) / HEAVIER, strict=True):
+            changed = wide.predict(theta, late, data, x, v).observed
+            for p, column in zip(heavier, whitened_changes(changed, data) / HEAVIER, strict=True):
                 found.setdefault(("mass", p.elements[0]), []).append(column[..., None])
         path = _path(problem, fit, data)
         position, velocity, acceleration = _along(problem, data, *states[data.episode])
@@ -254,7 +254,7 @@ def place_in_play(acceleration: FloatArray, step_s: float, play: float) -> Float
     return found
 
 
-def _bodies(problem: Problem) -> list[Parameter]:
+def masses(problem: Problem) -> list[Parameter]:
     """Return the masses of moving bodies that are neither searched nor known."""
     model, kind = problem.robot.model, KIND_TABLE["body_mass"]
     taken = {e for p in problem.space.parameters if p.kind == kind.name for e in p.elements}

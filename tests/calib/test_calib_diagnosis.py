@@ -19,7 +19,7 @@ from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes
 from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.diagnosis import all_allowed, name_causes
+from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, weighs
 from deal_hw.calib.validation.evidence import Evidence, evidence
 from deal_hw.calib.validation.explain import explained, try_explanations
 from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
@@ -29,10 +29,11 @@ from deal_hw.calib.validation.signatures import (
     Signature,
     SignatureResponse,
     held_direction,
+    masses,
     place_in_play,
     signatures,
 )
-from deal_hw.calib.validation.wider_models import zero_parameters
+from deal_hw.calib.validation.wider_models import fit_wider, zero_parameters
 from deal_hw.testing.plain_robots import make_robot
 from deal_hw.types import FloatArray
 
@@ -450,7 +451,7 @@ def test_play_behind_the_motors_encoder_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_a_mass_is_named_with_its_size() -> None:
+def test_a_mass_is_named_with_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last link weighs 50 % more."""
     _, problem, fit = truth("double-pendulum", "mass")
     found = name_causes(evidence(problem, fit))
@@ -458,6 +459,19 @@ def test_a_mass_is_named_with_its_size() -> None:
     assert "Weigh" in found[0].do and "heavier" in found[0].seen
     known = uncertainty_at(problem, fit, fixed_latency=False)
     assert known.alarms and with_causes(problem, fit, known, found)[0].alarms[0] == found[0]
+    # The signature is linear. A model with the mass must predict better, too, and keep some of it.
+    wide = fit_wider(problem, [p for p in masses(problem) if p.elements[0] == "fore"])
+    assert wide is not None and wide.found[0] == pytest.approx(1.5 * wide.more[0].nominal, rel=0.2)
+
+    def said(share: float) -> bool:
+        theta = np.append(wide.fit.theta[:-1], share * wide.more[0].nominal)
+        found_at = dataclasses.replace(wide, fit=dataclasses.replace(wide.fit, theta=theta))
+        monkeypatch.setattr(diagnosis, "fit_wider", lambda *_: found_at)
+        return weighs(problem, fit, found[0], all_allowed)
+
+    assert said(1.5) and not said(0.2)
+    monkeypatch.setattr(diagnosis, "gain_of", lambda *_: None)
+    assert not said(1.5)
 
 
 def test_half_of_two_recordings_is_a_part(small_problem: Callable[..., Problem]) -> None:
