@@ -66,16 +66,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
         def remove_node(self, node: Any) -> str | None:
             """Leave out what is done, where a worker would stop, and the test that ended this one."""
-            units = self.assigned_work[node]
+            units: dict[str, dict[str, bool]] = self.assigned_work[node]
             left = ((unit, name) for unit in units.values() for name, done in unit.items() if not done)
-            unit, crashed = next(left, ({}, None))
-            if crashed is not None:
-                unit[crashed] = True
+            first = next(left, None)
+            if first is not None:
+                first[0][first[1]] = True
             self.assigned_work[node] = {
                 scope: unit for scope, unit in units.items() if not all(unit.values())
             }
             super().remove_node(node)
-            return crashed
+            return None if first is None else first[1]
 
     config.option.loadscopereorder = False  # the order is that of pytest_collection_modifyitems
     return Scheduling(config, log)

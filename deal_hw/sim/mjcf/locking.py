@@ -127,7 +127,7 @@ def _rotated(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
 
 def _quaternion(spec: Any, body: Any) -> FloatArray:
     if body.alt.type == mujoco.mjtOrientation.mjORIENTATION_QUAT:
-        return np.asarray(body.quat) / np.linalg.norm(body.quat)
+        return np.asarray(body.quat / np.linalg.norm(body.quat))
     return np.asarray(
         spec.resolve_orientation(
             degree=spec.compiler.degree, sequence=spec.compiler.eulerseq, orientation=body.alt
