@@ -131,10 +131,12 @@ def weighs(problem: Problem, refined: Refined, cause: Diagnosis, allows: Allows)
     """Return whether a model with another mass of the named body predicts unseen motion better, too.
 
     The signature is the effect of 2 % of the mass, and the cause may be far more. A body that keeps less than
-    a fifth of its mass is no body with another mass: its mass takes up something else.
+    a fifth of its mass is no body with another mass: its mass takes up something else. Where no wider model
+    is fitted, as for a free base and without noise, the signature stands.
     """
     body = next(p for p in masses(problem) if p.elements[0] == cause.subject[0])
-    if not allows(MASS, wider_cost(problem, True, 1)):
+    fixed = problem.robot.base is None and not problem.noise_free
+    if not (fixed and allows(MASS, wider_cost(problem, True, 1))):
         return True
     wide = fit_wider(problem, [body])
     if wide is None or wide.found[0] <= body.low * (1 + LEAST_RISE):
