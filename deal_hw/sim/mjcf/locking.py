@@ -60,8 +60,7 @@ def lock_joints(mjcf: Path, at: Mapping[str, float | None], out: Path) -> Locked
             _move_body(spec, model, index[name], value, frozenset(index.values()))
     removed: list[str] = []
     _remove(removed, "tendon", spec, spec.tendons, _only_of(spec, at))
-    tendons = {t.name for t in spec.tendons}
-    gone = {model.tendon(i).name for i in range(model.ntendon)} - tendons
+    gone = {model.tendon(i).name for i in range(model.ntendon)} - {t.name for t in spec.tendons}
     _remove(removed, "equality", spec, spec.equalities, lambda e: _equality_goes(e, at, gone))
     actuators = [a for a in spec.actuators if _drives(a, at, gone)]
     numbers = {a.id for a in actuators}

@@ -87,14 +87,20 @@ def _places(words: tuple[str, ...]) -> dict[str, float | None]:
         name, equals, text = word.partition("=")
         if name in places:
             raise ConfigurationError(f"--joints: joint {name!r} is named twice")
-        try:
-            places[name] = float(text) if equals else None
-        except ValueError:
-            places[name] = math.nan
-        if equals and not math.isfinite(places[name] or 0.0):
+        places[name] = _number(text) if equals else None
+        if equals and places[name] is None:
             raise ConfigurationError(
                 f"--joints {shown(word)}: give NAME or NAME=VALUE, such as {name or 'finger'}=0.04 [rad or m]"
             )
     if not places:
         raise ConfigurationError("--joints: name at least one joint")
     return places
+
+
+def _number(text: str) -> float | None:
+    """Return a finite number; None for any other text."""
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
