@@ -275,6 +275,16 @@ class ParameterSpace:
             dataclasses.replace(p, low=low, high=high) if p.name == name else p for p in self.parameters
         )
 
+    def holding(self, theta: FloatArray) -> ParameterSpace:
+        """Return the space with ranges that hold these values, (K,)."""
+        values = dict(zip(self.names, map(float, theta), strict=True))
+        return ParameterSpace(
+            dataclasses.replace(p, low=min(p.low, values[p.name]), high=max(p.high, values[p.name]))
+            if p.name in values
+            else p
+            for p in self.parameters
+        )
+
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain JSON values."""
         return [p.to_json() for p in self.parameters]

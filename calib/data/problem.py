@@ -195,6 +195,7 @@ class Problem:
             they begin in the recorded first state.
         tasks: Does fits that do not depend on each other; see :mod:`deal_hw.calib.data.independent`.
         engine: What simulates the populations of searches; all else is simulated by MuJoCo, in float64.
+        guessed: Names of the parameters whose range nobody chose. It may grow where the data ask for it.
         command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
             to single commands of these recordings: a problem of others begins without.
         efforts: Columns of the joints whose recorded effort is compared, (E,); see
@@ -224,6 +225,7 @@ class Problem:
     noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
     engine: EngineName = "mujoco"
+    guessed: frozenset[str] = frozenset()
     _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:
@@ -367,14 +369,19 @@ class Problem:
         other.episodes = self.episodes if episodes is None else episodes
         return other
 
-    def with_more(self, parameters: Sequence[Parameter]) -> Problem:
-        """Return the problem with more parameters after its own; recordings and noise are shared."""
+    def with_space(self, space: ParameterSpace) -> Problem:
+        """Return the problem with other parameters or ranges; recordings and noise are shared."""
         other = copy.copy(self)
-        space = other.space = ParameterSpace((*self.space.parameters, *parameters))
+        other.space = space
+        other._batches = BatchPool(self.robot, space, self.threads, counted=self._batches.counted)
+        return other
+
+    def with_more(self, parameters: Sequence[Parameter]) -> Problem:
+        """Return the problem with more parameters after its own."""
+        other = self.with_space(ParameterSpace((*self.space.parameters, *parameters)))
         if self.command_delays is not None:
             theta = np.append(self.command_delays.theta, [p.nominal for p in parameters])
             other.command_delays = dataclasses.replace(self.command_delays, theta=theta)
-        other._batches = BatchPool(self.robot, space, self.threads, counted=self._batches.counted)
         return other
 
     def with_robot(self, robot: RobotModel) -> Problem:

@@ -250,7 +250,7 @@ def uncertainty(
     # Null directions scale by the range themselves, so only what was measured counts here.
     unseen = null_space(space, data[:K, :K] / inflation + np.diag(known[:K]))
     blind = unseen.std > IDENTIFIABLE_STD * _unit(space)
-    bound = _at_bound(space, theta, slope[:K]) * ~blind
+    bound = pressed_ends(space, theta, slope[:K]) * ~blind
     free = np.append(bound == 0, not fixed_latency)
     # V of the module's text, with the entries at bounds and a given latency held.
     precision = data / inflation + np.diag(belief)
@@ -292,7 +292,7 @@ def _unit(space: ParameterSpace) -> FloatArray:
     return np.asarray(np.where(space.log_scale, 1.0, space.width))
 
 
-def _at_bound(space: ParameterSpace, theta: FloatArray, slope: FloatArray) -> npt.NDArray[np.int64]:
+def pressed_ends(space: ParameterSpace, theta: FloatArray, slope: FloatArray) -> npt.NDArray[np.int64]:
     """Return -1 or 1 where a parameter ended at a bound that the data press, (K,)."""
     side = np.where(space.normalize(theta) < 0.5, -1, 1)
     return np.asarray(side * (ended_at_bound(space, theta) & (side * slope <= 0)))

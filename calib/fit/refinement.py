@@ -343,8 +343,10 @@ def _with_contacts(
     return point, normal, used
 
 
-def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None) -> Refined | None:
-    """Refine the nominal values; return None where simulations from there diverge.
+def local_fit(
+    problem: Problem, notify: Callable[[Refined], None] | None = None, start: Refined | None = None
+) -> Refined | None:
+    """Refine the nominal values, or those of another fit; return None where simulations from there diverge.
 
     It costs a small part of a search. Where the sensors' noise explains its residual, no search is needed. It
     fits a part of the recordings first, and all of them only where that part can be explained. ``notify``
@@ -361,6 +363,8 @@ def local_fit(problem: Problem, notify: Callable[[Refined], None] | None = None)
     )
     part = part_of(problem, LOCAL_S)
     theta, latency_s = problem.space.nominal, problem.first_latency_s
+    if start is not None:
+        theta, latency_s = start.theta, start.latency_s
     if part is problem or problem.noise_free:
         found = fit(problem, theta, latency_s)
         return found if np.isfinite(found.chi2) else None

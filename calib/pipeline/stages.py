@@ -21,11 +21,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calib.data.checks import check_excitation
-from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
-    CORRELATION_SAMPLES,
     EVIDENCE,
     MISMATCH_CHI2,
     WHITE_SAMPLES,
@@ -35,13 +33,9 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import (
     LOCAL_HOPELESS,
-    LOCAL_S,
     Refined,
-    from_start,
     local_fit,
-    part_of,
     refine,
-    window_stages,
 )
 from deal_hw.calib.pipeline.calibration_run import (
     AFTER_FIT,
@@ -50,6 +44,16 @@ from deal_hw.calib.pipeline.calibration_run import (
     CalibrationRun,
     FitOutcome,
 )
+from deal_hw.calib.pipeline.minima import (
+    ONE_SEARCH,
+    RESTARTS,
+    RestartSettings,
+    better,
+    conclusive,
+    lower_minimum,
+    refined_from,
+)
+from deal_hw.calib.pipeline.wider_ranges import grown_ranges, with_wider_ranges
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import (
     BEFORE_SEARCH,
@@ -63,7 +67,6 @@ from deal_hw.calibration import (
     listed,
 )
 from deal_hw.findings import Finding
-from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
@@ -72,40 +75,6 @@ if TYPE_CHECKING:
     from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
-
-CONTACT_DRAWN = 0
-"""Refinements from drawn points with feet on the floor, where each takes as long as a search."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RestartSettings:
-    """When to repeat a search from other random draws.
-
-    Attributes:
-        restarts: Most searches after the first.
-        same: Relative difference of chi2 below which two searches agree. Then the model is wrong, not the
-            search.
-        fewest_generations: Fewest generations left in the budget for another search.
-        explained: Chi2 below which noise explains the recordings, and no search follows.
-        drawn: Most refinements from other points, before another search: half from members of the search's
-            population, half drawn in the ranges. On cart-poles whose nominal values lead to another minimum,
-            about one in four of the latter leads to the truth. Where none of 8 did (1 to 4 s of balancing,
-            noise-free), one of the first three members did.
-    """
-
-    restarts: int = 2
-    same: float = 0.2
-    fewest_generations: int = 15
-    explained: float = MISMATCH_CHI2
-    drawn: int = 8
-
-    def draws(self, problem: Problem) -> int:
-        """Return the number of refinements from drawn points."""
-        return self.drawn if problem.robot.base is None else CONTACT_DRAWN
-
-
-RESTARTS = RestartSettings()
-ONE_SEARCH = RestartSettings(restarts=0, drawn=0)
 
 
 class Fits(abc.ABC):
@@ -179,9 +148,14 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             progress=progress,
             first_steps=steps,
         )
-        local = local_fit(problem, partial(run.offer, "local fit")) if self.settings.local_first else None
+        offer = partial(run.offer, "local fit")
+        local = local_fit(problem, offer) if self.settings.local_first else None
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
+        given = problem.space
+        if local is not None:
+            run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
+        problem = run.problem
         from deal_hw.calib.fit.channel_weights import weight_channels
         from deal_hw.calib.validation.explain import FAR, try_explanations
 
@@ -222,6 +196,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         }
         if run.problem.robot.step_s < problem.robot.step_s:
             provenance["fit_step_s"] = run.problem.robot.step_s
+        if grown := grown_ranges(given, found.space or searched.space):
+            provenance["grown_ranges"] = grown
         if run.left_out:
             provenance["checks_left_out"] = dict(run.left_out)
         # A fit that explains the recordings needs no sound critic before it.
@@ -286,63 +262,17 @@ class Refinement(Fits):
                 break
         if best is None:
             raise RuntimeError("unreachable: at least one search is run")
-        local, refined = run.local, best[1]
+        local, (searched, refined) = run.local, best
         if local is not None and local.chi2 < refined.chi2:
             # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
-                best = (best[0], local)
-        return conclude_fit(run, *best, attempt)
+                refined = local
+        run, refined = with_wider_ranges(run, refined, partial(_refined_again, run))
+        return conclude_fit(run, searched, refined, attempt)
 
 
-def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
-    """Return whether ``a`` is the better fit; window length counts only where both are explained."""
-    both = all(fit.chi2 < settings.explained for fit in (a, b))
-    if both and a.shooting.length != b.shooting.length:
-        return a.shooting.length > b.shooting.length
-    return a.chi2 < b.chi2
-
-
-def clearly_lower(a: Refined, b: Refined) -> bool:
-    """Return whether ``a`` has less residual than ``b``, by more than noise makes, on the same windows."""
-    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > EVIDENCE)
-
-
-def lower_minimum(
-    run: CalibrationRun, found: Refined, settings: RestartSettings, searched: CalibrationResult | None = None
-) -> Refined | None:
-    """Return the refinement from a drawn point that ends in a lower minimum; None where none does.
-
-    Half of the points are members of the search's last population, if there was a search: a brief one has
-    found the neighbourhood, but its mean may lead to a minimum beside the right one. Points are compared on a
-    part of the recordings. The first whose residual is white is taken, otherwise the lowest.
-    """
-    if not settings.draws(run.problem):
-        return None
-    part, shortest = part_of(run.problem, LOCAL_S), window_stages(run.problem)[:1]
-    run_part = dataclasses.replace(run, problem=part)
-    # Fixed: a refinement is analysis of the data and must not depend on the search's draws.
-    rng = np.random.default_rng(0)
-    same = best = refined_from(run_part, found.theta, found.latency_s, shortest)
-    # New start states alone may lead lower. Of other windows or data only an explained residual shows it.
-    alike = part is run.problem and same.shooting.length == found.shooting.length
-    again = clearly_lower(same, found) if alike else same.chi2 < settings.explained <= found.chi2
-    starts = [(theta, part.first_latency_s) for theta in part.space.sample(rng, settings.draws(part))]
-    if searched is not None and searched.population is not None:
-        near = rng.permutation(searched.population)[: len(starts) // 2]
-        starts = [(theta, searched.latency_s) for theta in near] + starts[: len(starts) - len(near)]
-    fits = in_order(part, partial(from_start, stages_s=shortest), starts)
-    while not ((again or best is not same) and conclusive(part, best, WHITE_SAMPLES)):
-        if (tried := next(fits, None)) is None:
-            break
-        if np.isfinite(tried.chi2):
-            run.offer("refinement", tried)
-        if clearly_lower(tried, best):
-            best = tried
-    fits.close()
-    if best is same and not again:
-        return None
-    lower = refined_from(run, best.theta, best.latency_s)
-    return lower if better(lower, found, settings) else None
+def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refined:
+    return refined_from(dataclasses.replace(run, problem=problem), fit.theta, fit.latency_s)
 
 
 def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun, Refined] | None:
@@ -446,6 +376,7 @@ def conclude_fit(
         chi2=refined.chi2,
         known=known,
         facts=facts,
+        space=problem.space,
     )
 
 
@@ -567,18 +498,6 @@ def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCa
         progress(Progress(BEFORE_SEARCH, 1, 1, f"the data do not determine: {'; '.join(words)}"))
 
 
-def conclusive(problem: Problem, fit: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
-    """Return whether noise explains the residual of a fit, so that no other check is needed.
-
-    A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the
-    longest autocorrelation time of a residual that counts as noise [samples].
-    """
-    from deal_hw.calib.validation.checks import unexplained
-
-    chosen = problem.known_std is not None and problem.robot.base is None
-    return not chosen and not unexplained(fit, longest)
-
-
 def without_search(problem: Problem, budget: Budget, local: Refined) -> CalibrationResult:
     """Return the local fit in place of a search's result."""
     space = problem.space
@@ -591,10 +510,3 @@ def without_search(problem: Problem, budget: Budget, local: Refined) -> Calibrat
         trace=({"generation": 0.0, "chi2": local.chi2},),
         provenance={"budget": dataclasses.asdict(budget)},
     )
-
-
-def refined_from(
-    run: CalibrationRun, theta: FloatArray, latency_s: float, stages_s: Sequence[float] | None = None
-) -> Refined:
-    """Refine from a search's estimate or another start."""
-    return from_start(run.problem, (theta, latency_s), stages_s, partial(run.offer, "refinement"))

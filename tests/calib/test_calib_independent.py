@@ -16,7 +16,7 @@ from deal_hw.calib.data.resume import Restarts, run_identity
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.methods import make_method
-from deal_hw.calib.pipeline.stages import RestartSettings, lower_minimum
+from deal_hw.calib.pipeline.minima import RestartSettings, lower_minimum
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget

@@ -34,17 +34,11 @@ from deal_hw.calib.fit.null_space import NullSpace, null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.fit.solver import correlated_samples
-from deal_hw.calib.pipeline import stages
+from deal_hw.calib.pipeline import minima, stages
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.methods import make_method, usual_budget
-from deal_hw.calib.pipeline.stages import (
-    CalibrationPipeline,
-    Refinement,
-    RestartSettings,
-    conclude_fit,
-    conclusive,
-    lower_minimum,
-)
+from deal_hw.calib.pipeline.minima import RestartSettings, conclusive, lower_minimum
+from deal_hw.calib.pipeline.stages import CalibrationPipeline, Refinement, conclude_fit
 from deal_hw.calib.validation.checks import doubtful, unexplained
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calib.validation.settings import Validation
@@ -167,8 +161,8 @@ def test_new_start_states_are_tried_before_drawn_points(
         calls.append(theta)
         return best if lower else stuck
 
-    monkeypatch.setattr(stages, "refined_from", refined)
-    monkeypatch.setattr(stages, "from_start", lambda problem, start, **_: refined(run, *start))
+    monkeypatch.setattr(minima, "refined_from", refined)
+    monkeypatch.setattr(minima, "from_start", lambda problem, start, **_: refined(run, *start))
     assert (lower_minimum(run, stuck, RestartSettings(drawn=4)) is best) == lower
     assert len(calls) == fits
 

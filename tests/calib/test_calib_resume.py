@@ -14,7 +14,8 @@ from fakes.simulated_episode import simulated_episode
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
 from deal_hw.calib.pipeline.methods import make_method
-from deal_hw.calib.pipeline.stages import CalibrationPipeline, Refinement, RestartSettings
+from deal_hw.calib.pipeline.minima import RestartSettings
+from deal_hw.calib.pipeline.stages import CalibrationPipeline, Refinement
 from deal_hw.calib.search.deal import Deal, DealSettings
 from deal_hw.calib.search.eki import Eki, EkiSettings
 from deal_hw.calib.validation.settings import Validation

@@ -71,6 +71,33 @@ def find_kind(name: str) -> Kind:
     return KIND_TABLE[name]
 
 
+def with_usual_range(space: ParameterSpace) -> frozenset[str]:
+    """Return the searched parameters whose range is the usual one of their kind: nobody chose it.
+
+    A parameter with an expected value is none of them.
+    """
+    return frozenset(
+        p.name
+        for p in space
+        if p.prior_std is None and (p.low, p.high) == find_kind(p.kind).usual_range(p.nominal, p.scale)
+    )
+
+
+def wider(space: ParameterSpace, sides: Mapping[str, int]) -> ParameterSpace:
+    """Return the space with ranges that go on at one end, by as much as the usual one does from its value.
+
+    Args:
+        space: The parameters.
+        sides: For each parameter whose range goes on, by name: -1 at its lower end, 1 at its higher one. No
+            range passes what its kind allows.
+    """
+    for name, side in sides.items():
+        p = space[name]
+        low, high = find_kind(p.kind).usual_range(p.low if side < 0 else p.high, p.scale)
+        space = space.with_range(name, *((low, p.high) if side < 0 else (p.low, high)))
+    return space
+
+
 def check_kinds(space: ParameterSpace) -> None:
     """Raise `UnknownNameError`, which lists the kinds, for a parameter of an unknown kind."""
     for parameter in space.parameters:

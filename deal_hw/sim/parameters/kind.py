@@ -73,6 +73,13 @@ class Kind:
     together: Together | None = None
     excludes: tuple[str, ...] = ()
 
+    def usual_range(self, nominal: float, scale: Scale) -> tuple[float, float]:
+        """Return the search range around a value where nobody gave one; above 0 on a log scale."""
+        if scale == "linear":
+            width = self.spread or abs(nominal) or 1.0
+            return max(nominal - width, self.least), min(nominal + width, self.most)
+        return max(nominal / self.ratio, self.least), min(nominal * self.ratio, self.most)
+
     def unit_of(self, model: Any, index: int) -> str:
         """Return the unit for one element of a model."""
         if not self.unit_slide:

@@ -262,8 +262,7 @@ def _range(
             )
         return low, high
     if "ratio" not in entry and scale == "linear":
-        width = kind.spread or abs(nominal) or 1.0
-        return max(nominal - width, kind.least), min(nominal + width, kind.most)
+        return kind.usual_range(nominal, scale)
     ratio = _number(entry.get("ratio", kind.ratio), f"ratio of {name!r}")
     if not ratio > 1:
         raise ConfigurationError(f"parameter {name!r}: `ratio` must be above 1, got {ratio:g}")

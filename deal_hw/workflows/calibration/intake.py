@@ -73,6 +73,7 @@ class CalibrationInput:
         policy: The policy that moved the robot all the time, if the method needs it.
         known_std: Expected standard deviation of the prediction error, positions then velocities, (2 C,);
             None: the sensor noise, estimated from the recordings.
+        guessed: Names of the parameters whose range nobody chose.
     """
 
     robot: RobotModel
@@ -88,6 +89,7 @@ class CalibrationInput:
     walks: bool = False
     policy: PopulationPolicy | None = None
     known_std: FloatArray | None = None
+    guessed: frozenset[str] = frozenset()
 
     @property
     def smoothing_s(self) -> float | None:
@@ -166,6 +168,10 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         space = sensitive_parameters(robot, space, fit, known_std, division.window_s, settings.threads, say)
         for name, parts in (("fitted_s", fit), ("heldout_s", judge)):
             provenance[name] = round(sum(map(seconds_of, parts)), 3)
+    from deal_hw.sim.parameters import with_usual_range
+
+    # The ranges of our own robots are chosen, and a ratio is for all parameters.
+    usual = isinstance(settings, UserRobotSettings) and settings.range_ratio is None
     return CalibrationInput(
         robot=robot,
         space=space,
@@ -180,6 +186,7 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         walks=walks,
         policy=source.policy,
         known_std=known_std,
+        guessed=with_usual_range(space) if usual else frozenset(),
     )
 
 

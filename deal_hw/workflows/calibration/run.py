@@ -185,10 +185,11 @@ class BestSoFar:
         if self.result is not None and not error < self._error:
             return
         self._error = error
-        low_high = np.stack([self._space.low, self._space.high], axis=1)
+        space = self._space.holding(estimate)
+        low_high = np.stack([space.low, space.high], axis=1)
         self.result = CalibrationResult(
             method=f"interrupted after {progress.stage}",
-            space=self._space,
+            space=space,
             estimate=estimate,
             interval=low_high,
             latency_s=latency_s,
@@ -257,6 +258,7 @@ def calibrate_input(
         start_std=dict(settings.start_std),
         tasks=task_map(settings.ray),
         engine=settings.engine,
+        guessed=work.guessed,
     )
 
 
@@ -285,6 +287,7 @@ def calibrate_episodes(
     tasks: TaskMap | None = None,
     laws: bool = True,
     engine: WantedEngine = "mujoco",
+    guessed: frozenset[str] = frozenset(),
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid, without writing results.
 
@@ -316,6 +319,8 @@ def calibrate_episodes(
         tasks: Does fits that do not depend on each other; None: this process.
         laws: Take a law that the model lacks where it predicts better.
         engine: What simulates the population of a search.
+        guessed: Names of the parameters whose range nobody chose; see
+            :mod:`deal_hw.calib.pipeline.wider_ranges`.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -351,6 +356,7 @@ def calibrate_episodes(
         smoothing_s=SMOOTHING_S if smoothing_s is None else smoothing_s,
         policy=policy,
         tasks=tasks or InThisProcess(),
+        guessed=guessed,
     )
     if engine != "mujoco":
         from deal_hw.sim.engine.warp_support import choose_engine
