@@ -225,7 +225,7 @@ class Problem:
     noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
     engine: EngineName = "mujoco"
-    guessed: frozenset[str] = frozenset()
+    guessed: tuple[str, ...] = ()
     _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:

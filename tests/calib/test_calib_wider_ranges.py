@@ -11,9 +11,10 @@ import pytest
 
 import deal_hw
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.data.resume import Restarts
+from deal_hw.calib.data.resume import Restarts, run_identity
 from deal_hw.calib.fit.refinement import Refined, local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calib.pipeline.wider_ranges import MOST, pressed, with_wider_ranges
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
@@ -128,7 +129,7 @@ def test_a_range_that_somebody_gave_stays(files: dict[str, Path], given: dict[st
     assert with_wider_ranges(run, fit, again) == (run, fit)
     assert not said
     # The same range as a guess grows.
-    guessed = dataclasses.replace(problem, guessed=frozenset(["shoulder.damping"]))
+    guessed = dataclasses.replace(problem, guessed=("shoulder.damping",))
     assert pressed(guessed, fit) == {"shoulder.damping": 1}
 
 
@@ -157,6 +158,23 @@ def test_a_range_grows_only_where_the_fit_becomes_better(files: dict[str, Path])
     assert wide.problem.space["shoulder.damping"].high == pytest.approx(2.5)
 
 
+def test_a_state_of_a_search_knows_which_ranges_may_grow(files: dict[str, Path]) -> None:
+    """A search in wider ranges does not go on from one in narrower ranges."""
+    problem = problem_of(files)
+    assert problem.guessed == (
+        "shoulder.frictionloss",
+        "shoulder.damping",
+        "shoulder.armature",
+        "shoulder.gain",
+    )
+    chosen = dataclasses.replace(problem, guessed=())
+    first, again, other = (
+        run_identity(of, make_method("default"), Budget(), np.random.default_rng(0))
+        for of in (problem, problem, chosen)
+    )
+    assert first == again != other
+
+
 def parameter(kind: str, nominal: float, low: float, high: float, **more: object) -> Parameter:
     """Return a parameter of a joint."""
     return Parameter(
@@ -175,7 +193,7 @@ def test_which_ranges_are_usual() -> None:
             parameter("joint_stiffness", 0.1, 0.1 / 4, 0.1 * 5),
         ]
     )
-    assert with_usual_range(space) == {"dof_damping", "dof_frictionloss", "command_asymmetry"}
+    assert with_usual_range(space) == ("dof_damping", "dof_frictionloss", "command_asymmetry")
 
 
 def test_a_range_goes_on_at_one_end_and_not_past_what_its_kind_allows() -> None:

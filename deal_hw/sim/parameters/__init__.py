@@ -71,12 +71,12 @@ def find_kind(name: str) -> Kind:
     return KIND_TABLE[name]
 
 
-def with_usual_range(space: ParameterSpace) -> frozenset[str]:
+def with_usual_range(space: ParameterSpace) -> tuple[str, ...]:
     """Return the searched parameters whose range is the usual one of their kind: nobody chose it.
 
     A parameter with an expected value is none of them.
     """
-    return frozenset(
+    return tuple(
         p.name
         for p in space
         if p.prior_std is None and (p.low, p.high) == find_kind(p.kind).usual_range(p.nominal, p.scale)

@@ -89,7 +89,7 @@ class CalibrationInput:
     walks: bool = False
     policy: PopulationPolicy | None = None
     known_std: FloatArray | None = None
-    guessed: frozenset[str] = frozenset()
+    guessed: tuple[str, ...] = ()
 
     @property
     def smoothing_s(self) -> float | None:
@@ -186,7 +186,7 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         walks=walks,
         policy=source.policy,
         known_std=known_std,
-        guessed=with_usual_range(space) if usual else frozenset(),
+        guessed=with_usual_range(space) if usual else (),
     )
 
 

@@ -287,7 +287,7 @@ def calibrate_episodes(
     tasks: TaskMap | None = None,
     laws: bool = True,
     engine: WantedEngine = "mujoco",
-    guessed: frozenset[str] = frozenset(),
+    guessed: tuple[str, ...] = (),
 ) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid, without writing results.
 
