@@ -186,6 +186,15 @@ def test_a_killed_bridge_damps_when_it_is_back(rig: BridgeRig) -> None:
         rig.await_commands([*reported, "damping", "stiff"])
 
 
+def test_a_bridge_survives_a_broken_pipe(rig: BridgeRig) -> None:
+    """A client that is killed makes the next TLS send raise SIGPIPE; the others keep the bridge."""
+    with BridgeClient(rig.port, rig.options("controller")) as client:
+        client.hear(lambda: client.frame is not None)
+        os.kill(rig.bridge.pid, signal.SIGPIPE)
+        states = client.states
+        client.hear(lambda: client.states > states + 200)
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP, signal.SIGALRM])
 def test_a_bridge_that_is_told_to_end_damps_first(rig: BridgeRig, number: signal.Signals) -> None:
     """While a controller holds the robot: each signal that ends or stops the bridge damps the robot first."""
