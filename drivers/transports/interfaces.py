@@ -7,10 +7,15 @@ import socket
 from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import psutil
 
 from deal_hw.errors import PortNotFoundError
+
+_INTERFACES: Final = Path("/sys/class/net")
+_FLAG_BITS: Final = {"up": 0x1, "loopback": 0x8, "multicast": 0x1000}
+"""Bits of an interface's file ``flags`` (IFF_UP, IFF_LOOPBACK and IFF_MULTICAST in Linux's if.h)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +46,7 @@ class Interface:
 def list_interfaces() -> tuple[Interface, ...]:
     """Return the interfaces of this machine."""
     addresses = _addresses()
-    return tuple(
-        _interface(name, set(state.flags.split(",")), addresses.get(name, ()))
-        for name, state in psutil.net_if_stats().items()
-    )
+    return tuple(_interface(name, flags, addresses.get(name, ())) for name, flags in _flags().items())
 
 
 def find_interface(port: str) -> Interface:
@@ -75,7 +77,7 @@ def find_interface(port: str) -> Interface:
 def _interface(name: str, flags: Set[str], addresses: tuple[str, ...]) -> Interface:
     carrier = "running" in flags
     with contextlib.suppress(OSError):
-        carrier = Path("/sys/class/net", name, "carrier").read_text().strip() == "1"
+        carrier = (_INTERFACES / name / "carrier").read_text().strip() == "1"
     return Interface(
         name=name,
         addresses=addresses,
@@ -84,6 +86,17 @@ def _interface(name: str, flags: Set[str], addresses: tuple[str, ...]) -> Interf
         multicast="multicast" in flags,
         loopback="loopback" in flags,
     )
+
+
+def _flags() -> dict[str, set[str]]:
+    """Return the flags of each interface, by psutil's names."""
+    try:
+        return {name: set(state.flags.split(",")) for name, state in psutil.net_if_stats().items()}
+    except OSError:
+        # psutil also asks for the speed, and QEMU's user-mode emulation of ARM has no answer to that.
+        folders = sorted(_INTERFACES.iterdir())
+        bits = {folder.name: int((folder / "flags").read_text(), 16) for folder in folders}
+        return {name: {flag for flag, bit in _FLAG_BITS.items() if bit & own} for name, own in bits.items()}
 
 
 def _addresses() -> dict[str, tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from pathlib import Path
 from types import SimpleNamespace
@@ -56,6 +57,28 @@ def test_a_label_is_no_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list_interfaces() == (
         Interface("eth0", ("10.0.0.2", "10.0.1.2"), up=True, carrier=False, multicast=True, loopback=False),
         Interface("eth1", (), up=False, carrier=False, multicast=False, loopback=False),
+    )
+
+
+def test_flags_without_psutil(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """QEMU's user-mode emulation refuses the question for the speed: the kernel's files have the flags."""
+    for name, flags, carrier in (("eth0", "0x1002", "0"), ("eth1", "0x1003", "1"), ("lo", "0x9", "1")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "flags").write_text(f"{flags}\n")
+        (tmp_path / name / "carrier").write_text(f"{carrier}\n")
+
+    def refuse() -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented (originated from ioctl(SIOCETHTOOL))")
+
+    monkeypatch.setattr(interfaces, "_INTERFACES", tmp_path)
+    monkeypatch.setattr(psutil, "net_if_stats", refuse)
+    monkeypatch.setattr(
+        psutil, "net_if_addrs", lambda: {"lo": [SimpleNamespace(family=socket.AF_INET, address="127.0.0.1")]}
+    )
+    assert list_interfaces() == (
+        Interface("eth0", (), up=False, carrier=False, multicast=True, loopback=False),
+        Interface("eth1", (), up=True, carrier=True, multicast=True, loopback=False),
+        LO,
     )
 
 
