@@ -36,9 +36,13 @@ undo() {
     ! mountpoint -q "$root/$each" || umount "$root/$each" || true
   done
   [ -z "${registered:-}" ] || echo -1 >$kernel/deal-hw-arm64
+  [ -z "${mounted:-}" ] || umount $kernel
 }
 trap undo EXIT
-[ -e $kernel/register ] || mount -t binfmt_misc binfmt_misc $kernel || miss "this kernel has no binfmt_misc"
+if [ ! -e $kernel/register ]; then
+  mount -t binfmt_misc binfmt_misc $kernel || miss "this kernel has no binfmt_misc"
+  mounted=1
+fi
 if ! grep -qs "interpreter $(realpath "$qemu")\$" $kernel/*aarch64*; then
   # F: the kernel opens QEMU now, so that it needs no copy in ROOT. The last registration counts.
   magic='\x7f\x45\x4c\x46\x02\x01\x01\x00\x00\x00\x00\x00\x00\x00\x00\x00\x02\x00\xb7\x00'
@@ -64,10 +68,10 @@ note "file system: $(inside chroot "$root" uname -m), $(inside chroot "$root" py
 
 # Cyclone itself is compiled by a cross compiler, because GCC under QEMU takes much longer.
 if [ ! -e "$root/opt/cyclonedds-11/lib/libddsc.so" ]; then
-  cmake -G Ninja -S "$source" -B "$root/root/cross" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
+  cmake -G Ninja -S "$source" -B "$root/opt/cross" -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 \
     -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc -DCMAKE_INSTALL_PREFIX=/opt/cyclonedds-11 -DBUILD_IDLC=ON \
     -DENABLE_SSL=OFF -DENABLE_ICEORYX=OFF >"$root.log" 2>&1 || miss "cmake failed; see $root.log"
-  QEMU_LD_PREFIX=$root DESTDIR=$root cmake --build "$root/root/cross" -j 2 --target install >"$root.log" 2>&1 \
+  QEMU_LD_PREFIX=$root DESTDIR=$root cmake --build "$root/opt/cross" -j 2 --target install >"$root.log" 2>&1 \
     || miss "Cyclone DDS does not build; see $root.log"
 fi
 note "Cyclone DDS 11.0.1"
@@ -75,15 +79,15 @@ note "Cyclone DDS 11.0.1"
 pip() { inside CYCLONEDDS_HOME=/opt/cyclonedds-11 chroot "$root" /opt/deal-hw/bin/pip install --quiet --no-compile "$@"; }
 [ -x "$root/opt/deal-hw/bin/pip" ] || inside chroot "$root" python3 -m venv /opt/deal-hw
 [ -e "$root"/opt/deal-hw/lib/python3.11/site-packages/cyclonedds/core.py ] || pip --no-binary cyclonedds cyclonedds==11.0.1
-copy=$(mktemp -d "$root/root/source.XXXX")
+copy=$(mktemp -d "$root/opt/source.XXXX")
 git ls-files -z | tar --create --null --files-from - | tar --extract --directory "$copy"
-rm -rf "$root/root/wheels"
-"$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$root/root/wheels" "$copy"
+rm -rf "$root/opt/wheels"
+"$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$root/opt/wheels" "$copy"
 rm -rf "$copy"
-cp constraints.txt "$root/root/wheels/"
-wheel=$(basename "$root"/root/wheels/deal_hw-*.whl)
-pip --constraint /root/wheels/constraints.txt "/root/wheels/$wheel[zenoh,deploy]"
-pip --no-deps --force-reinstall "/root/wheels/$wheel"
+cp constraints.txt "$root/opt/wheels/"
+wheel=$(basename "$root"/opt/wheels/deal_hw-*.whl)
+pip --constraint /opt/wheels/constraints.txt "/opt/wheels/$wheel[zenoh,deploy]"
+pip --no-deps --force-reinstall "/opt/wheels/$wheel"
 note "deal-hw: $wheel"
 
 PYTHONPATH=tools "$python" - "$root" <<'CHECK' || { note "the check failed"; exit 1; }

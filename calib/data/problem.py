@@ -198,8 +198,7 @@ class Problem:
         guessed: Names of the parameters whose range nobody chose. It may grow where the data ask for it.
         command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
             to single commands of these recordings: a problem of others begins without.
-        efforts: Columns of the joints whose recorded effort is compared, (E,); see
-            :mod:`deal_hw.sim.parameters.effort`.
+        efforts: Columns of the joints whose recorded effort is compared, (E,).
         channels: Indices of the measured channels into (position, velocity, effort), (M,).
         noise_std: Noise of (position, velocity, effort) over all speeds, (2 C + E,); valid for measured
             entries only.
