@@ -81,13 +81,13 @@ pip() { inside CYCLONEDDS_HOME=/opt/cyclonedds-11 chroot "$root" /opt/deal-hw/bi
 [ -e "$root"/opt/deal-hw/lib/python3.11/site-packages/cyclonedds/core.py ] || pip --no-binary cyclonedds cyclonedds==11.0.1
 copy=$(mktemp -d "$root/opt/source.XXXX")
 git ls-files -z | tar --create --null --files-from - | tar --extract --directory "$copy"
-rm -rf "$root/opt/wheels"
-"$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$root/opt/wheels" "$copy"
+rm -rf "$root/opt/built"
+"$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$root/opt/built" "$copy"
 rm -rf "$copy"
-cp constraints.txt "$root/opt/wheels/"
-wheel=$(basename "$root"/opt/wheels/deal_hw-*.whl)
-pip --constraint /opt/wheels/constraints.txt "/opt/wheels/$wheel[zenoh,deploy]"
-pip --no-deps --force-reinstall "/opt/wheels/$wheel"
+cp constraints.txt "$root/opt/built/"
+wheel=$(basename "$root"/opt/built/deal_hw-*.whl)
+pip --constraint /opt/built/constraints.txt "/opt/built/$wheel[zenoh,deploy]"
+pip --no-deps --force-reinstall "/opt/built/$wheel"
 note "deal-hw: $wheel"
 
 PYTHONPATH=tools "$python" - "$root" <<'CHECK' || { note "the check failed"; exit 1; }

@@ -11,10 +11,9 @@ import numpy as np
 
 from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import CORRELATION_SAMPLES, MISMATCH_CHI2, WHITE_SAMPLES
+from deal_hw.calib.fit.intervals import CORRELATION_SAMPLES, EVIDENCE, MISMATCH_CHI2, WHITE_SAMPLES
 from deal_hw.calib.fit.refinement import LOCAL_S, Refined, from_start, part_of, window_stages
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
-from deal_hw.calib.pipeline.wider_ranges import clearly_lower
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
 
@@ -59,6 +58,11 @@ def better(a: Refined, b: Refined, settings: RestartSettings) -> bool:
     if both and a.shooting.length != b.shooting.length:
         return a.shooting.length > b.shooting.length
     return a.chi2 < b.chi2
+
+
+def clearly_lower(a: Refined, b: Refined) -> bool:
+    """Return whether ``a`` has less residual than ``b``, by more than noise makes, on the same windows."""
+    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > EVIDENCE)
 
 
 def lower_minimum(

@@ -9,12 +9,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import numpy as np
-
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, pressed_ends
+from deal_hw.calib.fit.intervals import pressed_ends
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.minima import clearly_lower
 from deal_hw.calibration import BEFORE_SEARCH, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import wider
@@ -24,11 +23,6 @@ MOST = 2
 
 Again = Callable[[Problem, Refined], Refined | None]
 """Returns the fit with wider ranges, from that with narrower ones; None where it diverges."""
-
-
-def clearly_lower(a: Refined, b: Refined) -> bool:
-    """Return whether ``a`` has less residual than ``b``, by more than noise makes, on the same windows."""
-    return bool(a.normal.count * np.log(b.chi2 / a.chi2) > EVIDENCE)
 
 
 def pressed(problem: Problem, fit: Refined) -> dict[str, int]:
@@ -53,11 +47,10 @@ def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[
         fit: A fit to its recordings.
         again: Fits with wider ranges.
     """
-    grown: dict[str, int] = {}
+    given = run.problem.space
     for _ in range(MOST):
-        sides = pressed(run.problem, fit)
-        space = wider(run.problem.space, sides)
-        if not np.any(space.width > run.problem.space.width):
+        space = wider(run.problem.space, pressed(run.problem, fit))
+        if not grown_ranges(run.problem.space, space):
             break
         problem = run.problem.with_space(space)
         found = again(problem, fit)
@@ -68,13 +61,11 @@ def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[
         if not (longer or clearly_lower(found, fit)):
             break
         run, fit = dataclasses.replace(run, problem=problem), found
-        grown |= sides
-    if grown:
+    if grown := grown_ranges(given, run.problem.space):
         ranges = listed(
             [
-                f"{p.name} {p.low:.3g} to {p.high:.3g} {p.unit}".rstrip()
-                for p in run.problem.space
-                if p.name in grown
+                f"{name} {low:.3g} to {high:.3g} {given[name].unit}".rstrip()
+                for name, (low, high) in grown.items()
             ]
         )
         run.say(
