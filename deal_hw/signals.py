@@ -10,6 +10,8 @@ such signals and ends by its passive route. Not taken are:
 - SIGCHLD, SIGCONT, SIGURG and SIGWINCH, which end no program;
 - SIGTTIN and SIGTTOU, which are ignored: a program in the background then gets an error from the terminal, or
   just writes, and is not stopped with a stiff robot;
+- SIGPIPE, which is ignored: the write to a closed pipe or socket fails with an error. Another program on the
+  network would end ours otherwise, by closing a connection over TLS;
 - SIGXFSZ: Python ignores it, and the write beyond the limit fails with an error, which ends the run;
 - SIGHUP, if it was ignored when the program started: that is what ``nohup`` asks for;
 - others for which the program around has a handler, or which it ignores: they do not end it.
@@ -37,13 +39,14 @@ ENDING: Final = frozenset(int(number) for number in signal.valid_signals()) - {
     signal.SIGWINCH,
     signal.SIGTTIN,
     signal.SIGTTOU,
+    signal.SIGPIPE,
     signal.SIGXFSZ,
 }
 """Signals that end or suspend a program by default, the real-time signals included."""
-FOR_US: Final = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP, signal.SIGPIPE})
+FOR_US: Final = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP})
 """Taken even if the program around ignores or handles them. A shell lets programs in the background ignore
-SIGINT and SIGQUIT, and Python ignores SIGPIPE."""
-_IGNORED: Final = (signal.SIGTTIN, signal.SIGTTOU)
+SIGINT and SIGQUIT."""
+_IGNORED: Final = (signal.SIGTTIN, signal.SIGTTOU, signal.SIGPIPE)
 
 OPERATOR: Final = "stopped by the operator"
 SUSPENDED: Final = "suspended by the operator (Ctrl-Z)"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping
@@ -26,7 +25,7 @@ from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
 from deal_hw.ranges import Checked, Range
 from deal_hw.robots.connect import claim_name
-from deal_hw.signals import ENDING, reason, taken
+from deal_hw.signals import reason, taken
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.common import run_until
 from deal_hw.workflows.emulation.topics import free_port
@@ -113,8 +112,7 @@ def bridge(config: Bridge) -> int:
         signals.append(number)
         stop.set()
 
-    # A client that dies makes the next TLS send raise SIGPIPE, and the bridge must outlive its clients.
-    with taken(signalled, ENDING - {signal.SIGPIPE}):
+    with taken(signalled):
         port = free_port(config.end_point)
         clock = MonotonicClock()
         options = WireOptions(domain=config.domain)

@@ -96,7 +96,7 @@ def test_ctrl_c_does_not_end_the_recorder(
 ) -> None:
     """The supervisor hears of it and ends the run; cycles after it are still recorded."""
     feed(recorder, [encode(make_cycle(0))])
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE, signal.SIGALRM):
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGALRM):
         os.kill(recorder.process.pid, number)
     feed(recorder, [encode(make_cycle(1))])
     outcome = recorder.finish()
