@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from deal_hw.data.checks.command_kind import command_kind
+from deal_hw.data.importing.columns import read_column_map
 from deal_hw.data.importing.load import load_tables
 from deal_hw.data.table import Table
 from deal_hw.findings import Severity
@@ -142,3 +143,21 @@ def test_positions_in_another_unit_are_no_efforts(factor: float) -> None:
     command = wish(12.0, 0)
     made = table(factor * play(command, servo=True, seed=0), command)
     assert command_kind(made, servo=True).severity is Severity.OK
+
+
+def test_a_slow_joint_that_follows_a_torque(tmp_path: Path) -> None:
+    """A weight of 1 N·m/rad goes where a slow torque sends it; the column map says that it is a torque."""
+    time = np.arange(0.0, 12.0, 0.02)
+    torque = 0.6 * np.sin(2 * np.pi * 0.2 * time)
+    rows = np.column_stack([time, np.arcsin(torque / 0.981), torque])
+    recording = tmp_path / "slow.csv"
+    np.savetxt(recording, rows, delimiter=",", header="time,arm_pos,arm_tau", comments="")
+    columns = "time: time\nposition: '{joint}_pos'\ntarget: '{joint}_tau'\njoints: [arm]\n"
+    verdicts = []
+    for more in ("", "target_unit: Nm\n"):
+        (tmp_path / "columns.yaml").write_text(columns + more, encoding="utf-8")
+        (made,) = load_tables(recording, read_column_map(tmp_path / "columns.yaml"))
+        verdicts.append(command_kind(made, servo=False))
+    assert [verdict.severity for verdict in verdicts] == [Severity.FAIL, Severity.WARN]
+    assert "write `target_unit: Nm`" in verdicts[0].message
+    assert "map says Nm, so they are taken as efforts" in verdicts[1].message

@@ -2,7 +2,8 @@
 
 The two look alike in a file. A joint follows commanded positions; commanded efforts explain its acceleration
 instead. If the commands are of one kind and the model's actuators of the other, the check fails, since every
-fitted parameter would be meaningless.
+fitted parameter would be meaningless. A slow joint follows a torque, too, as a spring follows a force: where
+the column map gives the unit of an effort, efforts are taken as such, with a warning.
 """
 
 from __future__ import annotations
@@ -71,6 +72,15 @@ def command_kind(table: Table, *, servo: bool, limits: FloatArray | None = None)
         if not servo and "unsaid" in table.source:
             return Finding("actuation", Severity.FAIL, table.source["unsaid"])
         return beyond or Finding("actuation", Severity.OK, "the commands fit the model's actuators")
+    efforts = table.source.get("efforts", {})
+    if not servo and all(name in efforts for name in found):
+        units = " and ".join(sorted({efforts[name] for name in found}))
+        return beyond or Finding(
+            "actuation",
+            Severity.WARN,
+            f"the joints follow their commands ({', '.join(found)}) as they would follow positions; the "
+            f"column map says {units}, so they are taken as efforts",
+        )
     return Finding("actuation", Severity.FAIL, _accusation(found, servo=servo))
 
 
@@ -86,7 +96,8 @@ def _accusation(names: Sequence[str], *, servo: bool) -> str:
     return (
         f"commands that look like positions ({names_text}): the joints follow them, but the model has "
         "motors, which would take them as torques. Replace <motor> by <position joint=... kp=... kv=...> in "
-        "a copy of the MJCF, with the gains of the drives; or name the column of torques as `target`"
+        "a copy of the MJCF, with the gains of the drives; or name the column of torques as `target`. If "
+        "these are torques (N·m) or forces (N), write `target_unit: Nm` or `N` into the column map"
     )
 
 

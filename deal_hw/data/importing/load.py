@@ -13,7 +13,7 @@ from mcap.records import Chunk, Metadata
 
 from deal_hw.data.files import INDEX_NAME
 from deal_hw.data.importing.channels import Channels, digest_of_file
-from deal_hw.data.importing.columns import ColumnMap, JointColumns, JointKinds, TimeColumn
+from deal_hw.data.importing.columns import EFFORT_UNITS, ColumnMap, JointColumns, JointKinds, TimeColumn
 from deal_hw.data.importing.guess import channels_of_joints, guess_columns, guess_time
 from deal_hw.data.importing.guess_topics import guess_topics
 from deal_hw.data.importing.table import build_table
@@ -136,6 +136,8 @@ def tables_of(
         table = build_table(channels, used, joints)
         if unsaid := _unsaid(table, used):
             table.source["unsaid"] = unsaid
+        if efforts := {j.name: j.target_unit for j in used.joints if j.target_unit in EFFORT_UNITS}:
+            table.source["efforts"] = efforts
         if say is not None:
             _tell_turns(say, table)
         tables.append(table)
