@@ -28,7 +28,7 @@ class RestartSettings:
     Attributes:
         restarts: Most searches after the first.
         same: Relative difference of chi2 below which two searches agree. Then the model is wrong, not the
-            search.
+            search. Also the share of what noise does not explain by which a drawn point must end lower.
         fewest_generations: Fewest generations left in the budget for another search.
         explained: Chi2 below which noise explains the recordings, and no search follows.
         drawn: Most refinements from other points, before another search: half from members of the search's
@@ -46,6 +46,10 @@ class RestartSettings:
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
         return self.drawn if problem.robot.base is None else CONTACT_DRAWN
+
+    def much_lower(self, a: Refined, b: Refined) -> bool:
+        """Return whether ``a`` explains a good part of what ``b`` leaves beyond noise."""
+        return b.chi2 - a.chi2 > self.same * (b.chi2 - 1.0)
 
 
 RESTARTS = RestartSettings()

@@ -251,8 +251,10 @@ class Refinement(Fits):
             same = False
             if attempt == 0 and refined.chi2 >= settings.explained and settings.draws(run.problem):
                 lower = lower_minimum(run, refined, settings, searched)
-                # No drawn point ends lower: the model is wrong, not the search.
-                refined, same = lower or refined, lower is None
+                # No drawn point ends much lower: the model is wrong, not the search. Far above the noise
+                # each ends a little lower or higher, and that is no reason for a search of minutes.
+                same = lower is None or not settings.much_lower(lower, refined)
+                refined = lower or refined
             # Two searches with the same unexplained residual say this, too.
             previous = best[1].chi2 if best is not None else np.inf
             same = same or abs(refined.chi2 - previous) < settings.same * previous
