@@ -154,8 +154,15 @@ class CalibrationRun:
             why = "the local fit leaves more than noise, so "
         self.say(BEFORE_SEARCH, f"{why}{kind} follows ({search.name})")
 
-    def offer(self, stage: str, found: Refined | OutputErrorFit | CalibrationResult) -> None:
-        """Report a candidate estimate and the stage that found it."""
+    def offer(
+        self,
+        stage: str,
+        found: Refined | OutputErrorFit | CalibrationResult,
+        done: int = 1,
+        total: int = 1,
+        source: str = "",
+    ) -> None:
+        """Report a candidate estimate, the stage that found it, how far that is, and from where it began."""
         theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
         candidate = {"estimate": theta, "latency_s": found.latency_s, "values": {"chi2": found.chi2}}
-        self.say(stage, f"chi2 {found.chi2:.3g}", 1, 1, **candidate)
+        self.say(stage, f"{source}chi2 {found.chi2:.3g}", done, total, **candidate)

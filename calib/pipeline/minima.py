@@ -93,11 +93,13 @@ def lower_minimum(
         near = rng.permutation(searched.population)[: len(starts) // 2]
         starts = [(theta, searched.latency_s) for theta in near] + starts[: len(starts) - len(near)]
     fits = in_order(part, partial(from_start, stages_s=shortest), starts)
+    done = 0
     while not ((again or best is not same) and conclusive(part, best, WHITE_SAMPLES)):
         if (tried := next(fits, None)) is None:
             break
+        done += 1
         if np.isfinite(tried.chi2):
-            run.offer("refinement", tried)
+            run.offer("refinement", tried, done, len(starts), "from another point, ")
         if clearly_lower(tried, best):
             best = tried
     fits.close()
