@@ -6,13 +6,13 @@ A calibration first refines the nominal values, without any search.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from deal_hw.calib.data.parts import BEGIN_S, part_of
 from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.contacts import START_ITERATIONS, fit_starts, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
@@ -64,9 +64,6 @@ GIVEN_RIGHT = 1.0
 
 MOST_WINDOWS = 0.75
 """Share of the windows that counts as most [-]."""
-
-LOCAL_S = 8.0
-"""Length of data on which the local fit starts [s]."""
 
 LOCAL_HOPELESS = 4.0
 """Chi2 of the shortest windows above which the local fit does not continue."""
@@ -361,7 +358,7 @@ def local_fit(
         hopeless=hopeless,
         notify_step=_clear_gains(notify) if notify is not None else None,
     )
-    part = part_of(problem, LOCAL_S)
+    part = part_of(problem, BEGIN_S)
     theta, latency_s = problem.space.nominal, problem.first_latency_s
     if start is not None:
         theta, latency_s = start.theta, start.latency_s
@@ -377,15 +374,3 @@ def local_fit(
     except InsufficientDataError:
         # No recording holds a longer window.
         return fit(problem, found.theta, found.latency_s, (short,))
-
-
-def part_of(problem: Problem, seconds: float) -> Problem:
-    """Return the problem with evenly spread pieces of a second that add up to about ``seconds``."""
-    lengths = [len(e.sample) for e in problem.episodes]
-    period_s = problem.episodes[0].period_s
-    piece = max(round(1.0 / period_s), 1)
-    # Rounding must not make a whole of a half: the ratio of two recordings to their half may be 1.9999...
-    every = max(math.floor(sum(lengths) * period_s / seconds * (1 + 1e-9)), 1)
-    number = np.arange(sum(lengths)) // piece
-    kept = np.split(number % every == 0, np.cumsum(lengths)[:-1])
-    return problem.part(kept) if every > 1 else problem

@@ -50,8 +50,10 @@ from deal_hw.calib.pipeline.minima import (
     RestartSettings,
     better,
     conclusive,
+    gains_on_part,
     lower_minimum,
     refined_from,
+    refined_search,
 )
 from deal_hw.calib.pipeline.wider_ranges import grown_ranges, with_wider_ranges
 from deal_hw.calib.validation.settings import Validation
@@ -247,14 +249,10 @@ class Refinement(Fits):
             searched = run.attempts.run(run.problem, attempt, budget, run.progress)
             run.offer("search", searched)
             left -= len(searched.trace)
-            refined = refined_from(run, searched.estimate, searched.latency_s)
-            same = False
-            if attempt == 0 and refined.chi2 >= settings.explained and settings.draws(run.problem):
-                lower = lower_minimum(run, refined, settings, searched)
-                # No drawn point ends much lower: the model is wrong, not the search. Far above the noise
-                # each ends a little lower or higher, and that is no reason for a search of minutes.
-                same = lower is None or not settings.much_lower(lower, refined)
-                refined = lower or refined
+            if attempt == 0:
+                refined, same = refined_search(run, searched, settings)
+            else:
+                refined, same = refined_from(run, searched.estimate, searched.latency_s), False
             # Two searches with the same unexplained residual say this, too.
             previous = best[1].chi2 if best is not None else np.inf
             same = same or abs(refined.chi2 - previous) < settings.same * previous
@@ -273,7 +271,10 @@ class Refinement(Fits):
         return conclude_fit(run, searched, refined, attempt)
 
 
-def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refined:
+def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refined | None:
+    """Refine a fit in wider ranges; None where they gain nothing in a part of long recordings."""
+    if not gains_on_part(run, problem, fit):
+        return None
     return refined_from(dataclasses.replace(run, problem=problem), fit.theta, fit.latency_s)
 
 

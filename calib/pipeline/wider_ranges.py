@@ -22,7 +22,7 @@ MOST = 2
 """Most times that a range grows: a factor of 125 for most kinds. Beyond it the model is wrong."""
 
 Again = Callable[[Problem, Refined], Refined | None]
-"""Returns the fit with wider ranges, from that with narrower ones; None where it diverges."""
+"""Returns the fit with wider ranges, from that with narrower ones; None where none is better."""
 
 
 def pressed(problem: Problem, fit: Refined) -> dict[str, int]:

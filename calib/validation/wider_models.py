@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deal_hw.calib.data.parts import BEGIN_S, part_of
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.intervals import EVIDENCE
-from deal_hw.calib.fit.refinement import LOCAL_S, Refined, at_parameters, part_of, refine
+from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter
 from deal_hw.sim.parameters import KIND_TABLE
@@ -89,7 +90,7 @@ def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
     """Fit with more parameters to a part of the recordings; None where it cannot be fitted."""
     wide = problem.with_more(more)
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    part = part_of(wide, min(LOCAL_S, total_s / 2))
+    part = part_of(wide, min(BEGIN_S, total_s / 2))
     seen = [e.usable for e in part.episodes]
     rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
     try:
@@ -107,7 +108,7 @@ def wider_cost(problem: Problem, fits: bool, more: int = 0) -> float:
     Each fit takes about half of its most iterations. The model as it is gets one, too.
     """
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    periods = min(LOCAL_S, total_s / 2) / problem.robot.step_s
+    periods = min(BEGIN_S, total_s / 2) / problem.robot.step_s
     # Derivatives by each value and start state, and a line of damped steps.
     members = 2 + len(problem.space) + more + 2 * problem.coordinates + 10
     predictions = total_s / problem.robot.step_s

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from fakes.plain_truth import problem_of, truth
 
+from deal_hw.calib.data.parts import part_of
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import part_of, refine
+from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds

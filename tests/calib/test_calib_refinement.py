@@ -175,7 +175,8 @@ def test_only_the_first_search_is_brief(
     """What a brief search leaves unexplained is searched for to the end, unless drawn points end no lower."""
     problem = Problem(noisy.robot, noisy.space, [noisy.fit], threads=1)
     refined = dataclasses.replace(refine(problem, noisy.theta, noisy.latency_s), chi2=9.0)
-    monkeypatch.setattr(stages, "refined_from", lambda *_: refined)
+    for module in (minima, stages):
+        monkeypatch.setattr(module, "refined_from", lambda *_: refined)
     search = FixedSearch(noisy.theta, noisy.latency_s, 0.05)
     run = CalibrationRun(
         problem=problem,
