@@ -8,12 +8,13 @@ motions. It is taken where it predicts every fold better than all fits without i
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
@@ -24,6 +25,7 @@ from deal_hw.calib.validation.explain import RIVAL, applicable, screened, screen
 from deal_hw.calib.validation.explanations import Explanation
 from deal_hw.calib.validation.wider_models import NOTICED
 from deal_hw.calibration import listed, percent
+from deal_hw.errors import CalibrationError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
@@ -103,29 +105,87 @@ class LawfulChoice:
     """A choice among fits with and without laws.
 
     Attributes:
-        made: The choice.
+        made: The choice, with the errors of the fits that were judged in every fold.
         law: The law of the chosen fit; None where that has none.
         ratios: Its error in each fold over that of the best fit without a law; empty where it has none.
+        lost: Errors of fits with laws up to the fold that a fit without one predicts as well.
     """
 
     made: Choice
     law: LawCandidate | None = None
     ratios: Sequence[float] = ()
+    lost: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, choice: Choice, laws: Sequence[LawCandidate]) -> LawfulChoice:
-        """Return the choice: a fit with a law only where it predicts each fold better than all without."""
-        by_name = {name: law for law in laws for name in law.names}
-        law = by_name.get(choice.chosen)
-        if law is None:
-            return cls(choice)
-        means = {n: float(np.mean(np.log(e))) for n, e in choice.errors.items() if n not in by_name}
-        plain = min(means, key=lambda name: means[name])
-        pairs = zip(choice.errors[choice.chosen], choice.errors[plain], strict=True)
-        ratios = [mine / other for mine, other in pairs]
-        if max(ratios) < 1:
-            return cls(choice, law, ratios)
-        return cls(dataclasses.replace(choice, chosen=plain))
+    def of(
+        cls, plain: Choice, laws: Sequence[LawCandidate], errors: Mapping[str, Sequence[float]]
+    ) -> LawfulChoice:
+        """Return the choice: a fit with a law only where it predicts each fold better than all without.
+
+        ``plain`` compares the fits without laws, and ``errors`` are those of :func:`law_errors`.
+        """
+        if not errors:
+            return cls(plain)
+        each = list(zip(*plain.errors.values(), strict=True))
+        ratios = {n: [e / min(of) for e, of in zip(es, each, strict=False)] for n, es in errors.items()}
+        won = {n for n, r in ratios.items() if len(r) == len(each) and max(r) < 1}
+        lost = {n: tuple(e) for n, e in errors.items() if n not in won}
+        if not won:
+            return cls(plain, lost=lost)
+        best = min(sorted(won), key=lambda n: float(np.mean(np.log(errors[n]))))
+        every = dict(plain.errors) | {n: tuple(errors[n]) for n in errors if n in won}
+        law = next(law for law in laws if best in law.names)
+        return cls(dataclasses.replace(plain, chosen=best, errors=every), law, ratios[best], lost)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values: the choice, and the laws that lost."""
+        lost = {name: list(errors) for name, errors in self.lost.items()}
+        return self.made.to_json() | ({"lost": lost} if lost else {})
+
+
+def law_errors(
+    problem: Problem,
+    masks: Sequence[Sequence[Mask]],
+    laws: Sequence[LawCandidate],
+    start: Member,
+    plain: Choice,
+    errors: Callable[[Problem, Sequence[Member]], FloatArray],
+    say: Callable[[int, str], None] = lambda fold, law: None,
+) -> dict[str, list[float]]:
+    """Return the error of each fit with a law in each fold, up to the first in which one without is as good.
+
+    It would not be taken, whatever the other folds say, and a law can cost several times the bare physics.
+
+    Args:
+        problem: The recordings, as they are fitted.
+        masks: The samples of each recording that each fold leaves out, (T,) each.
+        laws: The laws.
+        start: Fit of short windows without a law, to all recordings.
+        plain: Errors of the fits without a law.
+        errors: Returns the error of each member's predictions of a part, (N,).
+        say: Called with the number of each fold and the law that is fitted to it.
+    """
+    found: dict[str, list[float]] = {name: [] for law in laws for name in law.names}
+    left = set(found)
+    for fold, left_out in enumerate(masks):
+        least = min(each[fold] for each in plain.errors.values())
+        train, test = problem.part([~mask for mask in left_out]), problem.part(left_out)
+        for law in laws:
+            if left.isdisjoint(law.names):
+                continue
+            say(fold, law.explanation.name)
+            try:
+                members = law.members(train, start, fold=True)
+                values = errors(law.widened(test), list(members.values()))
+            except CalibrationError:
+                left.difference_update(law.names)
+                continue
+            for name, value in zip(members, map(float, values), strict=True):
+                if name in left:
+                    found[name].append(value)
+                if not value < least:
+                    left.discard(name)
+    return found
 
 
 def screened_laws(

@@ -71,6 +71,11 @@ neighbourhood."""
 FOLDS = 3
 """Number of folds over the motions; a single motion is split in time."""
 
+FOLD_STEPS = 3
+"""Most steps of a fit without a law in a fold. It begins in the minimum of all recordings. On the real
+SO-101 its error in a fold was then within 7 % of that after up to 24 steps, its mean within 3 %; after one
+step it still knew what was left out (20 % below)."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputErrorSettings:
@@ -185,8 +190,9 @@ class OutputErrorFits(Fits):
         choice, law = decided.made, decided.law
         run.say("fit", f"{choice.chosen} on all recordings")
         searched_start = searched if better else None
-        laws = () if law is None else (law,)
-        members = self._members(problem, first, windows, searched_start, laws, choice.chosen)
+        members = self._members(problem, first, windows, searched_start, choice.chosen)
+        if law is not None:
+            members |= law.members(problem, windows[0].member, fold=False)
         theta, latency_s = members[choice.chosen]
         if law is not None:
             problem = law.widened(problem)
@@ -233,7 +239,7 @@ class OutputErrorFits(Fits):
             facts["law"] = law.facts(decided, theta)
         names = problem.channel_names
         facts |= {
-            "cross_validation": choice.to_json(),
+            "cross_validation": decided.to_json(),
             "residual_std": dict(zip(names, map(float, first.scale), strict=True)),
             "prediction_rmse": dict(zip(names, map(float, fit.scale), strict=True)),
             "window_s": recipe.seconds,
@@ -300,18 +306,18 @@ class OutputErrorFits(Fits):
 
         Each fit of a fold continues from that of all recordings, ``whole``: the minimum is near, and a fit
         ends in it whatever its start. Without ``search``, that on all recordings was no better start, and no
-        fold is searched. Fits with laws are candidates, too.
+        fold is searched. Fits with laws follow, as long as they predict better than all without.
         """
-        from deal_hw.calib.pipeline.law_choice import LawfulChoice
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice, law_errors
         from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, on_folds, time_masks
 
         settings, before = self.settings, problem.steps
         motions = motion_numbers(problem.episodes)[-1] + 1
         masks = time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
 
-        def say(fold: int) -> None:
-            question = f"{fold + 1} of {len(masks)}: which fit predicts unseen data best?"
-            run.say("cross-validation", question)
+        def say(fold: int, law: str = "") -> None:
+            question = f"does {law} predict it better?" if law else "which fit predicts unseen data best?"
+            run.say("cross-validation", f"{fold + 1} of {len(masks)}: {question}")
 
         # Sent to workers, so without the fits, which hold the recordings.
         fits = partial(
@@ -320,16 +326,16 @@ class OutputErrorFits(Fits):
             seed=seed,
             search=run.attempts.search if search else None,
             budget=run.budget,
-            laws=laws,
         )
-        errors = partial(_errors, laws=laws, seconds=settings.long_s)
+        errors = partial(_errors, seconds=settings.long_s)
         on = problem
         if search and problem.policy is not None:
             # A search may run the policy, whose network cannot be sent.
             on = copy.copy(problem)
             on.tasks = InThisProcess()
         found = on_folds(on, masks, fits, errors, "long", settings.long_s, say)
-        return LawfulChoice.of(dataclasses.replace(found, steps=problem.steps - before), laws)
+        gained = {} if found.note else law_errors(problem, masks, laws, whole[1].member, found, errors, say)
+        return LawfulChoice.of(dataclasses.replace(found, steps=problem.steps - before), laws, gained)
 
     def _of_fold(
         self,
@@ -339,15 +345,16 @@ class OutputErrorFits(Fits):
         seed: int,
         search: CalibrationMethod[Problem] | None,
         budget: Budget,
-        laws: Sequence[LawCandidate],
     ) -> dict[str, Member]:
-        """Return every candidate from the data of a fold."""
-        first, *windows = [fit_output_error(train, *start, recipe) for start, recipe in starts]
+        """Return every candidate without a law from the data of a fold."""
+        first, *windows = [
+            fit_output_error(train, *start, recipe, iterations=FOLD_STEPS) for start, recipe in starts
+        ]
         searched = None
         if search is not None:
             rng = np.random.default_rng([seed, fold])
             searched = search.run(self._reduced(train, first), budget, rng)
-        return self._members(train, first, windows, searched, laws)
+        return self._members(train, first, windows, searched)
 
     def _better_start(self, problem: Problem, first: OutputErrorFit, searched: CalibrationResult) -> bool:
         """Return whether the search's estimate predicts short windows better than the first fit."""
@@ -370,10 +377,9 @@ class OutputErrorFits(Fits):
         first: OutputErrorFit,
         windows: Sequence[OutputErrorFit],
         searched: CalibrationResult | None,
-        laws: Sequence[LawCandidate],
         only: str | None = None,
     ) -> dict[str, Member]:
-        """Return every candidate's estimate, those with laws last, or as many as ``only`` needs."""
+        """Return the estimate of every candidate without a law, or of as many as ``only`` needs."""
         settings, found = self.settings, {"short": first.member}
         if searched is not None:
             found["search"] = searched.estimate, searched.latency_s
@@ -383,10 +389,8 @@ class OutputErrorFits(Fits):
             if only in (None, name):
                 theta, latency_s = found["long"]
                 latency_s = latency_s if recipe.latency else problem.first_latency_s
-                found[name] = fit_output_error(problem, theta, latency_s, recipe).member
-        for law in laws:
-            if only is None or only in law.names:
-                found |= law.members(problem, windows[0].member, fold=only is None)
+                most = FOLD_STEPS if only is None else None
+                found[name] = fit_output_error(problem, theta, latency_s, recipe, iterations=most).member
         return found
 
     def _split_half(
@@ -499,15 +503,9 @@ def _joined_stretches(problem: Problem) -> Problem:
     return problem.on(episodes, problem.known_std) if len(episodes) < len(problem.episodes) else problem
 
 
-def _errors(
-    test: Problem, members: Sequence[Member], laws: Sequence[LawCandidate], seconds: float
-) -> FloatArray:
-    """Return the errors of the members' predictions over a time [s], (N,); the last members have laws."""
-    plain = [one for one in members if len(one[0]) == len(test.space)]
-    rmse = list(prediction_rmse(test, plain, seconds))
-    for law in laws:
-        each = members[len(rmse) :][: len(law.names)]
-        rmse += list(prediction_rmse(law.widened(test), each, seconds))
+def _errors(test: Problem, members: Sequence[Member], seconds: float) -> FloatArray:
+    """Return the errors of the members' predictions over a time [s], (N,)."""
+    rmse = prediction_rmse(test, members, seconds)
     return np.array([_error(test, of_channels) for of_channels in rmse])
 
 

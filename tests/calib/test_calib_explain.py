@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +13,12 @@ import pytest
 from fakes.law_robots import SERVO, robot
 from fakes.plain_truth import refused, truth
 
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
-from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice
+from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice, law_errors
 from deal_hw.calib.pipeline.output_error_fits import OutputErrorFits
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, with_explanation
 from deal_hw.calib.report.verdict import trust
@@ -167,13 +169,37 @@ def test_without_laws_a_law_is_only_named() -> None:
 def test_a_law_must_predict_every_fold() -> None:
     """A mean that one fold makes is no evidence; a law that wins each fold is taken."""
     law = LawCandidate(PLAY_LAW, (), (0.4, 2.0))
-    errors = {"short": (3.0, 3.0), "long": (2.0, 2.0), law.names[0]: (2.5, 2.5), law.names[1]: (1.0, 2.1)}
-    mixed = LawfulChoice.of(Choice(law.names[1], errors, 2.0), [law])
-    assert mixed.law is None and mixed.made.chosen == "long"
-    errors[law.names[1]] = (1.0, 1.5)
-    won = LawfulChoice.of(Choice(law.names[1], errors, 2.0), [law])
-    assert won.law is law and won.ratios == [0.5, 0.75] and won.made.chosen == law.names[1]
-    assert LawfulChoice.of(Choice("long", errors, 2.0), [law]) == LawfulChoice(Choice("long", errors, 2.0))
+    short, long = law.names
+    plain = Choice("long", {"short": (3.0, 1.9), "long": (2.0, 2.0)}, 2.0)
+    mixed = LawfulChoice.of(plain, [law], {short: [2.5], long: [1.0, 1.95]})
+    assert mixed.law is None and mixed.made == plain
+    assert mixed.to_json()["lost"] == {short: [2.5], long: [1.0, 1.95]}
+    won = LawfulChoice.of(plain, [law], {short: [2.5], long: [1.0, 1.52]})
+    assert won.law is law and won.ratios == pytest.approx([0.5, 0.8])
+    assert won.made.chosen == long and set(won.made.errors) == {"short", "long", long}
+    assert LawfulChoice.of(plain, [], {}) == LawfulChoice(plain)
+
+
+def test_a_law_that_loses_a_fold_is_fitted_to_no_other(
+    small_problem: Callable[..., Problem], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The short fit loses at once, and the long one in the second fold, so there is no third."""
+    problem = small_problem()
+    law, folds = LawCandidate(PLAY_LAW, (), (0.4, 2.0)), list[tuple[int, str]]()
+    masks = [[np.arange(len(e.sample)) % 3 == k for e in problem.episodes] for k in range(3)]
+    start = problem.space.nominal, 0.0
+    monkeypatch.setattr(LawCandidate, "members", lambda *_, **__: dict.fromkeys(law.names, start))
+    plain = Choice("long", {"short": (3.0, 3.0, 3.0), "long": (2.0, 2.0, 2.0)}, 2.0)
+    judged = iter([[2.5, 1.0], [1.0, 2.5]])
+
+    def errors(*_: Any) -> Any:
+        return np.array(next(judged))
+
+    found = law_errors(problem, masks, [law], start, plain, errors, lambda *now: folds.append(now))
+    assert found == {law.names[0]: [2.5], law.names[1]: [1.0, 2.5]} and folds == [
+        (0, PLAY_LAW.name),
+        (1, PLAY_LAW.name),
+    ]
 
 
 def test_a_lag_is_tried_from_the_filter_of_the_mjcf(tmp_path: Path) -> None:
