@@ -69,7 +69,7 @@ def unseen(levels: Sequence[float], same: float) -> float:
     """
     fits, minima, lowest = len(levels), 0, -np.inf
     for level in sorted(levels):
-        if not minima or level - lowest > same * max(lowest - 1.0, 0.0):
+        if not minima or level > lowest + same * max(lowest - 1.0, 0.0):
             minima, lowest = minima + 1, level
     return 1.0 if fits < 2 else minima * (minima + 1) / (fits * (fits - 1))
 
@@ -100,10 +100,10 @@ def refined_search(
     search. Far above the noise each ends a little lower or higher, and that is no reason for another search,
     of minutes. Of long recordings a part decides where to begin, and all of them are refined once.
     """
-    part = part_of(run.problem, BEGIN_S)
+    part, start = part_of(run.problem, BEGIN_S), (searched.estimate, searched.latency_s)
     if part is not run.problem and settings.draws(run.problem):
         on_part = dataclasses.replace(run, problem=part)
-        begun = refined_from(on_part, searched.estimate, searched.latency_s, _shortest(run))
+        begun = refined_from(on_part, *start, _shortest(run))
         # The local fit of the same windows, which had no reason to go on to longer ones.
         if run.local is not None and run.local.normal.count == begun.normal.count:
             begun = run.local if clearly_lower(run.local, begun) else begun
@@ -111,7 +111,8 @@ def refined_search(
             best = _lowest(on_part, begun, settings, searched)
             refined = refined_from(run, best.theta, best.latency_s)
             return refined, not settings.much_lower(best, begun)
-    refined = refined_from(run, searched.estimate, searched.latency_s)
+        start = begun.theta, begun.latency_s
+    refined = refined_from(run, *start)
     if refined.chi2 < settings.explained or not settings.draws(run.problem):
         return refined, False
     lower = lower_minimum(run, refined, settings, searched)
