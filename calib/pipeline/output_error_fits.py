@@ -189,15 +189,15 @@ class OutputErrorFits(Fits):
             decided = self._choose(run, problem, seed, (first, *windows), tried, search=better)
         choice, law = decided.made, decided.law
         run.say("fit", f"{choice.chosen} on all recordings")
-        searched_start = searched if better else None
-        members = self._members(problem, first, windows, searched_start, choice.chosen)
-        if law is not None:
-            members |= law.members(problem, windows[0].member, fold=False)
-        theta, latency_s = members[choice.chosen]
-        if law is not None:
+        if law is None:
+            searched_start = searched if better else None
+            members = self._members(problem, first, windows, searched_start, choice.chosen)
+        else:
+            members = law.members(problem, windows[0].member, fold=False)
             problem = law.widened(problem)
             # The local fit knows of no law.
             run = dataclasses.replace(run, problem=law.widened(run.problem), local=None)
+        theta, latency_s = members[choice.chosen]
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
