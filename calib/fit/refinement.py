@@ -264,7 +264,7 @@ def at_parameters(
         point = fit_starts(shooting, point, START_ITERATIONS)[0]
         normal = shooting.normal(point)
     else:
-        point, normal = converged(shooting, point, shooting.normal(point), START_ITERATIONS)
+        point, normal = converged(shooting, point, START_ITERATIONS)
         point, normal = restarted(shooting, point, normal)
     return dataclasses.replace(_refined(shooting, point, normal, 0), theta=theta, latency_s=latency_s)
 

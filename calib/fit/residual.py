@@ -239,13 +239,20 @@ class Shooting:
         return self.problem.space.from_scale(point.value[:-1])
 
     def normal(
-        self, point: Point, keep: bool = False, stretch: float = 1.0, *, central: bool = False
+        self,
+        point: Point,
+        keep: bool = False,
+        stretch: float = 1.0,
+        *,
+        central: bool = False,
+        states_only: bool = False,
     ) -> Normal:
         """Return the normal equations at a point; derivatives by forward differences in one batch.
 
         With ``keep`` the linearised residuals, which take much memory, are returned, too. ``stretch`` is a
         factor on the differences' steps; negative for backward ones. ``central`` differences cost twice as
-        much: the truncation error of one-sided ones looks like information where there is none.
+        much: the truncation error of one-sided ones looks like information where there is none. With
+        ``states_only`` parameters have no derivatives: enough for a step of the start states, and cheaper.
         """
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.given else C
@@ -276,16 +283,27 @@ class Shooting:
                 v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
             # Row n of `values`, `x` and `v` has entry n of (p, s_w) changed by its step, in all windows at
             # once: windows do not share start states.
-            predicted = self._predict(values, data, x, v).observed
+            acting = np.append(np.full(K + 1, not states_only), np.ones(2 * moved, dtype=bool))
+            predicted = self._predict(values[acting], data, x[acting], v[acting]).observed
             r = data.whitened(base[e] - data.measured)
             difference = predicted - base[e]
             if central:
                 here_x, here_v = point.position[e], point.velocity[e]
-                other = self._predict(2 * point.value - values, data, 2 * here_x - x, 2 * here_v - v).observed
-                two = ~one_sided
+                at = (
+                    (2 * point.value - values)[acting],
+                    data,
+                    (2 * here_x - x)[acting],
+                    (2 * here_v - v)[acting],
+                )
+                other = self._predict(*at).observed
+                two = ~one_sided[acting]
                 # (y(p + h) - y(p - h)) / 2; divided by h below, as y(p + h) - y(p) is.
                 difference[two] = (predicted - other)[two] / 2
-            jac = np.moveaxis(data.whitened(difference), 0, -1) / steps
+            jac = np.moveaxis(data.whitened(difference), 0, -1) / steps[acting]
+            if not acting.all():
+                every = np.zeros((*r.shape, members))
+                every[..., acting] = jac
+                jac = every
             if np.isfinite(r).all():
                 # A column that diverges beside a finite base gives no direction.
                 jac = np.nan_to_num(jac, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
@@ -334,8 +352,11 @@ class Shooting:
             return Point(value, point.position, point.velocity)
         ways = []
         for gain, shift in normal.back:
+            stay = np.zeros_like(shift)
             follow = gain @ step
-            ways.append(-np.stack([np.zeros_like(shift), shift, follow, shift + follow]))
+            # Without a step two of the ways are the others.
+            more = [follow, shift + follow] if step.any() else []
+            ways.append(-np.stack([stay, shift, *more]))
         return self.moved(point, value, ways)
 
     def moved(self, point: Point, value: FloatArray, ways: Sequence[FloatArray]) -> Point:

@@ -188,7 +188,7 @@ def solve(
     while True:
         fit = _Following(shooting, point, normal, notify)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=shooting.fixed_latency)
-        point, normal = converged(shooting, fit.at(value), fit.normal_at(value), 1)
+        point, normal = converged(shooting, fit.at(value), 1, fit.normal_at(value))
         point, normal = restarted(shooting, point, normal)
         used += max(more, 1)
         gained = normal.cost < before * (1 - RESTART_GAIN)
@@ -199,16 +199,27 @@ def solve(
     return point, dataclasses.replace(normal, rows=()), used
 
 
-def converged(shooting: Shooting, point: Point, normal: Normal, iterations: int) -> tuple[Point, Normal]:
-    """Fit start states alone, without contacts, from a point and the normal equations there.
+def converged(
+    shooting: Shooting, point: Point, iterations: int, normal: Normal | None = None
+) -> tuple[Point, Normal]:
+    """Fit start states alone, without contacts, from a point and, if known, the normal equations there.
 
     Parameters stay, and no window's cost grows.
     """
+    point, known = _with_states(shooting, point, iterations, normal)
+    return point, known or shooting.normal(point, keep=normal is not None and bool(normal.rows))
+
+
+def _with_states(
+    shooting: Shooting, point: Point, iterations: int, normal: Normal | None = None
+) -> tuple[Point, Normal | None]:
+    """Return a point with fitted start states, and the given normal equations if it has not moved."""
     for _ in range(0 if shooting.given else iterations):
-        moved = shooting.followed(point, normal, np.zeros_like(point.value))
-        if not shooting.cost(moved) < normal.cost * (1 - STATES_CONVERGED):
+        here = normal or shooting.normal(point, states_only=True)
+        moved = shooting.followed(point, here, np.zeros_like(point.value))
+        if not shooting.cost(moved) < here.cost * (1 - STATES_CONVERGED):
             break
-        point, normal = moved, shooting.normal(moved, keep=bool(normal.rows))
+        point, normal = moved, None
     return point, normal
 
 
@@ -228,7 +239,7 @@ def restarted(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, 
     position, velocity = list(point.position), list(point.velocity)
     for states in (shooting.smoothed(), shooting.states(point, handed_on=True)):
         start = part.start(shooting.theta(point), float(point.value[-1]), states)
-        tried, _ = converged(part, start, part.normal(start), RESTART_ITERATIONS)
+        tried, _ = _with_states(part, start, RESTART_ITERATIONS)
         here = Point(point.value, *(tuple(s[e][w] for e, w in place) for s in (position, velocity)))
         costs = zip(part.window_costs(tried), part.window_costs(here), strict=True)
         for k, ((e, windows), (new, old)) in enumerate(zip(place, costs, strict=True)):
@@ -239,7 +250,8 @@ def restarted(shooting: Shooting, point: Point, normal: Normal) -> tuple[Point, 
     moved = Point(point.value, tuple(position), tuple(velocity))
     if not shooting.cost(moved) < normal.cost * (1 - STATES_CONVERGED):
         return point, normal
-    return converged(shooting, moved, shooting.normal(moved, keep=bool(normal.rows)), 1)
+    moved, _ = _with_states(shooting, moved, 1)
+    return moved, shooting.normal(moved, keep=bool(normal.rows))
 
 
 def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
