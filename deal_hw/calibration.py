@@ -47,6 +47,7 @@ class Progress:
         latency_s: The population's mean total latency [s], or None.
         values: Further values of this generation or iteration, as in the result's trace.
         estimate: A complete fit, (K,) physical values, with ``latency_s``; None within a search or a fit.
+        space: Its parameters: at least those of the calibration; None: these.
     """
 
     stage: str
@@ -57,6 +58,7 @@ class Progress:
     latency_s: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
     estimate: FloatArray | None = None
+    space: ParameterSpace | None = None
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -80,9 +82,9 @@ class Budget:
 
 
 def percent(share: float) -> str:
-    """Return a share as text, in percent with two digits, or as a whole number from 100 on."""
+    """Return a share as text, in percent with two digits, as a whole number from 100 to a million."""
     value = 100 * share
-    return f"{value:.2g} %" if value < 99.5 else f"{value:.0f} %"
+    return f"{value:.0f} %" if 99.5 <= value < 1e6 else f"{value:.2g} %"
 
 
 def std_words(parameter: Parameter, std: float) -> str:

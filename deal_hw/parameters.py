@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, get_args
 
@@ -47,6 +47,7 @@ class Parameter:
         prior_mean: Expected physical value; None: no expectation.
         prior_std: Standard deviation of the expectation in the parameter's own scale: a share of the value
         (0.05 for 5 %) on a log scale, in the parameter's unit on a linear one.
+        setup: The set-up in whose recordings it acts, or "@" and the name of one recording; "" for all.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = FINITE
@@ -62,6 +63,7 @@ class Parameter:
     known: bool = False
     prior_mean: float | None = None
     prior_std: float | None = None
+    setup: str = ""
 
     @classmethod
     def around(
@@ -79,17 +81,21 @@ class Parameter:
         )
 
     @classmethod
-    def encoder_bias(cls, joint: str, most: float) -> Parameter:
-        """Return a joint's encoder bias, reported minus true position, up to ``most`` to both sides [rad]."""
+    def encoder_bias(cls, joint: str, most: float, *, unit: str = "rad", setup: str = "") -> Parameter:
+        """Return a joint's encoder bias, reported minus true position, up to ``most`` to both sides.
+
+        ``most`` is in the joint's ``unit``. With a ``setup`` it is that of the set-up's recordings alone.
+        """
         return cls(
-            name=f"{joint}.encoder_bias",
+            name=f"{joint}.encoder_bias" + (f"@{setup.removeprefix('@')}" if setup else ""),
             kind="encoder_bias",
             elements=(joint,),
-            unit="rad",
+            unit=unit,
             nominal=0.0,
             low=-most,
             high=most,
             scale="linear",
+            setup=setup,
         )
 
     def __post_init__(self) -> None:
@@ -136,6 +142,8 @@ class Parameter:
         if self.prior_mean is None:
             # Policies contain a digest of these values; policies from before priors existed must keep it.
             del values["prior_mean"], values["prior_std"]
+        if not self.setup:
+            del values["setup"]
         return values
 
 
@@ -339,6 +347,28 @@ class ParameterDistribution:
             space=ParameterSpace(p for p in self.space.parameters if p.name not in left),
             mean=self.mean[kept],
             covariance=None if self.covariance is None else self.covariance[np.ix_(kept, kept)],
+        )
+
+    def with_more(
+        self, parameters: Sequence[Parameter], mean: FloatArray, std: FloatArray
+    ) -> ParameterDistribution:
+        """Return the distribution with more parameters after its own, which depend on no other.
+
+        Args:
+            parameters: L parameters.
+            mean: Their physical values, (L,).
+            std: Their standard deviations in each one's own scale, (L,).
+        """
+        K = len(self.space)
+        if self.covariance is None:
+            raise ValueError("a uniform distribution has no standard deviations")
+        covariance = np.diag(np.concatenate([np.zeros(K), np.square(std)]))
+        covariance[:K, :K] = self.covariance
+        return dataclasses.replace(
+            self,
+            space=ParameterSpace([*self.space.parameters, *parameters]),
+            mean=np.append(self.mean, mean),
+            covariance=covariance,
         )
 
     def sample(self, rng: np.random.Generator, count: int) -> FloatArray:

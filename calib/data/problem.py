@@ -11,10 +11,9 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from deal_hw.calib.data.noise import (
     FLOOR_STD,
@@ -36,6 +35,7 @@ from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.parameters.effort import EFFORT_NOISE
 from deal_hw.sim.recordings.episode import SampledEpisode, fill_gaps
+from deal_hw.sim.recordings.own_setups import in_own_setups
 from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
 from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray, IntArray
@@ -228,6 +228,7 @@ class Problem:
     _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:
+        self.robot, self.episodes = in_own_setups(self.robot, self.episodes, self.space)
         self._batches = BatchPool(self.robot, self.space, self.threads)
         given = () if self.fixed_latency_s is None else (self.fixed_latency_s,)
         (low, high), longest = self.latency_range_s, LONGEST_LATENCY_S
@@ -372,7 +373,8 @@ class Problem:
         """Return the problem with other parameters or ranges; recordings and noise are shared."""
         other = copy.copy(self)
         other.space = space
-        other._batches = BatchPool(self.robot, space, self.threads, counted=self._batches.counted)
+        other.robot, other.episodes = in_own_setups(self.robot, self.episodes, space)
+        other._batches = BatchPool(other.robot, space, self.threads, counted=self._batches.counted)
         return other
 
     def with_more(self, parameters: Sequence[Parameter]) -> Problem:
@@ -438,6 +440,11 @@ class Problem:
     def batches(self, count: int, index: int) -> list[ServoBatch]:
         """Return simulators with ``count`` members in all, one for each thread, as :meth:`batch`."""
         return self._batches.parts(count, self.episodes[index].setup)
+
+    def acts(self, index: int) -> Mask:
+        """Return which free parameters act on an episode, (K,); others are of other set-ups."""
+        here = self.robot.in_setup(self.episodes[index].setup).acting(self.space)
+        return np.array([bool(p.elements) for p in here.free], dtype=bool)
 
     def measured(self, index: int) -> FloatArray:
         """Return the measured channels of an episode, (T, M)."""
@@ -589,12 +596,3 @@ def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
 def measurements(windows: Sequence[WindowData]) -> int:
     """Return the number of measurements in windows."""
     return sum(int(np.count_nonzero(data.reported)) for data in windows)
-
-
-def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
-    """Return the windows under a mask (W,), or at these rows."""
-    names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
-    windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
-    late = None if data.late is None else data.late[chosen]
-    values = {name: getattr(data, name)[chosen] for name in names}
-    return dataclasses.replace(data, windows=windows, late=late, **values)

@@ -283,7 +283,8 @@ class Shooting:
                 v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
             # Row n of `values`, `x` and `v` has entry n of (p, s_w) changed by its step, in all windows at
             # once: windows do not share start states.
-            acting = np.append(np.full(K + 1, not states_only), np.ones(2 * moved, dtype=bool))
+            acting = np.append(self.problem.acts(data.episode), np.ones(1 + 2 * moved, dtype=bool))
+            acting[: K + 1] &= not states_only
             predicted = self._predict(values[acting], data, x[acting], v[acting]).observed
             r = data.whitened(base[e] - data.measured)
             difference = predicted - base[e]
@@ -301,6 +302,7 @@ class Shooting:
                 difference[two] = (predicted - other)[two] / 2
             jac = np.moveaxis(data.whitened(difference), 0, -1) / steps[acting]
             if not acting.all():
+                # Parameters of other set-ups change nothing here, and are not simulated.
                 every = np.zeros((*r.shape, members))
                 every[..., acting] = jac
                 jac = every

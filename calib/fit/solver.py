@@ -30,7 +30,8 @@ import scipy
 from scipy.optimize import lsq_linear
 
 from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
-from deal_hw.calib.data.problem import WindowData, taken
+from deal_hw.calib.data.parts import taken
+from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 SHARED_ERRORS = "errors that commands and measurements share"
 EXPLANATIONS = "laws that the model lacks"
+OWN_ZEROS = "zeros of each recording"
 AFTER_FIT = "after the fit"
 """Names of checks."""
 
@@ -164,5 +165,6 @@ class CalibrationRun:
     ) -> None:
         """Report a candidate estimate, the stage that found it, how far that is, and from where it began."""
         theta = found.estimate if isinstance(found, CalibrationResult) else found.theta
-        candidate = {"estimate": theta, "latency_s": found.latency_s, "values": {"chi2": found.chi2}}
+        candidate: dict[str, Any] = {"estimate": theta, "latency_s": found.latency_s}
+        candidate |= {"values": {"chi2": found.chi2}, "space": self.problem.space}
         self.say(stage, f"{source}chi2 {found.chi2:.3g}", done, total, **candidate)

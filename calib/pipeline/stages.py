@@ -55,6 +55,7 @@ from deal_hw.calib.pipeline.minima import (
     refined_from,
     refined_search,
 )
+from deal_hw.calib.pipeline.own_zeros import with_own_zeros
 from deal_hw.calib.pipeline.wider_ranges import grown_ranges, with_wider_ranges
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import (
@@ -169,6 +170,10 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         if local is not None and not white and (finer := with_finer_step(run, local)) is not None:
             run, local = finer
             white = True
+        zeros = None
+        if local is not None and not white and (zeros := with_own_zeros(run, local)) is not None:
+            run, local = zeros.run, zeros.fit
+            white = True
         if local is not None and white:
             found = conclude_fit(run, None, local)
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
@@ -186,6 +191,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                     tried = try_explanations(problem, with_rows(local), run.may_try)
                 run = dataclasses.replace(run, tried=tried)
             found = with_explanation(run) or with_shared_error(fits, run)
+        found = found if zeros is None else zeros.said(found)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {

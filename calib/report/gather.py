@@ -11,10 +11,12 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, whitened_residual
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, longest_windows, samples_in
+from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.sim.recordings.own_setups import OWN
 from deal_hw.sim.recordings.parts import joined
 from deal_hw.types import FloatArray
 from deal_hw.viz.robot_drawing import RobotDrawing, draw_robot
@@ -134,10 +136,13 @@ def gather(
         shown = group[: max(min(MOST_PANELS // len(group[0].channels), len(group)), 1)]
         if len(group) > len(shown):
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
-        problem = Problem(robot, result.space, shown, threads=threads, fixed_latency_s=result.latency_s)
+        space = with_other_zeros(result.space, robot.description, shown)
+        problem = Problem(robot, space, shown, threads=threads, fixed_latency_s=result.latency_s)
+        each = zip(theta, latency_s, strict=True)
+        members = np.stack([fitted_zeros(problem, values, float(late)) for values, late in each])
         titles = [_title(e, f"{word} recording {i} of {len(group)}", parts) for i, e in enumerate(shown, 1)]
         for data in _windows(problem, window_s):
-            predicted = problem.predict(theta, latency_s, data)
+            predicted = problem.predict(members, latency_s, data)
             overlays.append(_overlay(problem, data, predicted, titles[data.episode], heldout))
             if heldout and drawing is None:
                 drawing = _worst_moment(problem, data, predicted, titles[data.episode])
@@ -162,7 +167,8 @@ def _title(episode: SampledEpisode, other: str, parts: Counter[str]) -> str:
     if not episode.name:
         return other
     between = f", {episode.time_s[0]:.4g} to {episode.time_s[-1]:.4g} s"
-    setup = f", set-up {episode.setup}" if episode.setup else ""
+    named = episode.setup and not episode.setup.startswith(OWN)
+    setup = f", set-up {episode.setup}" if named else ""
     return episode.name + setup + (between if parts[episode.name] > 1 else "")
 
 

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.verdict import grouped, make_story, trust
+from deal_hw.calib.validation.recording_zeros import next_zeros
 from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
@@ -25,7 +26,6 @@ from deal_hw.parameters import Parameter, ParameterDistribution
 from deal_hw.sim.engine.model import RobotModel, at_step
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 from deal_hw.sim.mjcf.exports import write_exports
-from deal_hw.sim.parameters import present
 from deal_hw.sim.parameters.effort import EFFORT_KINDS
 
 DISTRIBUTION = "distribution.json"
@@ -333,12 +333,13 @@ def model_distribution(robot: RobotModel, result: CalibrationResult) -> Paramete
     """Return the calibrated distribution of the parameters that act on the robot's own model.
 
     A payload is in a set-up only, and what an effort sensor reports moves nothing. Both are in the result,
-    but no policy is trained with them.
+    but no policy is trained with them. Where recordings had zeros of their own, the next one's is unknown.
     """
-    here = present(result.space, robot.absent)
+    here = robot.acting(result.space)
     sensors = [kind.name for kind in EFFORT_KINDS]
     idle = (p.name for p in here.parameters if not p.elements or p.kind in sensors)
-    return result.distribution().without(idle)
+    more = next_zeros(robot.description, result.space, result.estimate)
+    return result.distribution().without(idle).with_more(*more)
 
 
 def write_model(robot: RobotModel, result: CalibrationResult, path: Path) -> tuple[Path, ...]:

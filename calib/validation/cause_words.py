@@ -112,6 +112,13 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
         "A mass, its centre or an encoder's zero was not free.",
         "Free encoder_bias, body_mass or body_ipos of {} (--parameters).",
     ),
+    "zero": (
+        "an encoder whose zero is another one in each recording",
+        "The zeros were not the same in all recordings, as after a start where friction held the robot off "
+        "its rest.",
+        "Set the zero of {} in the same pose before each recording. Or give each recording a set-up with "
+        "`encoder_bias` of its own, which is searched (--setups).",
+    ),
     "mass": (
         "another mass",
         "The ratio of the bodies' masses is not the model's.",

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from deal_hw.calib.data.problem import Member, Problem, taken
+from deal_hw.calib.data.parts import taken
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import (
     CORRELATION_SAMPLES,
     MISMATCH_CHI2,

@@ -29,6 +29,7 @@ from deal_hw.calib.validation.explain import (
     try_explanations,
 )
 from deal_hw.calib.validation.random_delay import random_delay
+from deal_hw.calib.validation.recording_zeros import named_zeros
 from deal_hw.calib.validation.signatures import Cause, Signature, masses
 from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost, zero_parameters
 from deal_hw.calibration import listed, percent
@@ -192,13 +193,15 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
         gains = [known.gain(taken, group) for group in groups]
         if not gains or max(gains) <= EVIDENCE:
             break
-        group = groups[int(np.argmax(gains))]
+        group = groups[_simplest(groups, gains)]
         share = 1 - float(np.exp(-max(gains) / known.count))
         if share <= NOTICED:
             break
         found.append(_cause_diagnosis(known, taken, group, share, max(gains)))
         taken += group
         groups = [g for g in groups if g[0].cause != group[0].cause]
+        if group[0].cause == "zero":
+            groups = [g for g in groups if g[0].cause != "load"]
     if found and not supported(1 - float(np.prod([1 - one.share for one in found])), chi2):
         found, taken = [], []
         if (play := _alone_at_reversals(known)) is not None:
@@ -212,6 +215,15 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     if bursts is not None and left * (1 - bursts.share) <= BURST_LEFT:
         found.append(bursts)
     return sorted(found, key=lambda f: -f.deviance)
+
+
+def _simplest(groups: Sequence[Sequence[Signature]], gains: Sequence[float]) -> int:
+    """Return the group that gains most; a constant force where zeros of each recording gain no more."""
+    best, causes = int(np.argmax(gains)), [group[0].cause for group in groups]
+    if causes[best] == "zero" and "load" in causes:
+        load = causes.index("load")
+        return load if gains[best] - gains[load] <= EVIDENCE else best
+    return best
 
 
 def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
@@ -247,6 +259,8 @@ def _cause_diagnosis(
     cause = group[0].cause
     if cause == "mass":
         found = _mass_diagnosis(known, taken, share, deviance)
+    elif cause == "zero":
+        found = _zero_diagnosis(known, taken, group, share, deviance)
     else:
         gains = np.array([known.gain(taken, [signature]) for signature in group])
         order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
@@ -296,6 +310,25 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
     if rotors:
         do += f" If it is a rotor's inertia, free dof_armature of {listed(rotors)}."
     return Diagnosis.of("mass", share, deviance, names, Finding.alarm(seen, means, do))
+
+
+def _zero_diagnosis(
+    known: Evidence, taken: Sequence[Signature], group: Sequence[Signature], share: float, deviance: float
+) -> Diagnosis:
+    """Name the zero of each recording, of the joints that need their own ones beside the others."""
+    # The residual is prediction minus measurement: a zero moves against its coefficient.
+    values = -known.coefficients([*taken, *group])[-len(group) :]
+    found: dict[str, str] = {}
+    joints = known.places(taken, group) or list(dict.fromkeys(s.where for s in group))
+    for joint in joints:
+        mine = [s.where == joint for s in group]
+        each = dict(zip(known.recordings, map(float, values[mine]), strict=True))
+        found[joint] = named_zeros(joint, group[mine.index(True)].unit, each)
+    looks, means, do = LOOKS["zero"]
+    seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: zero."
+    seen = f"{seen} {'; '.join(found.values())}."
+    alarm = Finding.alarm(seen, means, do.replace("{}", listed(joints)))
+    return Diagnosis.of("zero", share, deviance, joints, alarm)
 
 
 def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:

@@ -14,12 +14,19 @@ from functools import cached_property
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import ended_at_bound
+from deal_hw.calib.fit.intervals import EVIDENCE, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation.cause_words import SearchedKinds
 from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.signatures import Signature, SignatureResponse, answers, signatures
+from deal_hw.calib.validation.signatures import (
+    Signature,
+    SignatureResponse,
+    answers,
+    by_recording,
+    signatures,
+)
+from deal_hw.sim.recordings.own_setups import recording_of
 from deal_hw.types import FloatArray
 
 FOLDS = 4
@@ -59,6 +66,11 @@ class Evidence:
     time_s: Sequence[FloatArray] = ()
     names: Sequence[str] = ()
     searched: SearchedKinds = field(default_factory=SearchedKinds)
+
+    @property
+    def recordings(self) -> list[str]:
+        """Names of the recordings, each once; parts between gaps are of one."""
+        return list(dict.fromkeys(map(recording_of, self.names)))
 
     @cached_property
     def _following(self) -> list[FloatArray]:
@@ -128,7 +140,8 @@ class Evidence:
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
         matrix, vector, squares, prior = self._normal(taken)
-        fold = fold_numbers(len(squares), FOLDS, ROUNDS)
+        # So that no fold leaves out a whole recording, which may have a zero of its own.
+        fold = fold_numbers(len(squares), FOLDS, max(ROUNDS, len(self.recordings)))
         cost = 0.0
         for k in range(FOLDS):
             mine, others = fold == k, fold != k
@@ -140,6 +153,15 @@ class Evidence:
     def gain(self, taken: Sequence[Signature], more: Sequence[Signature]) -> float:
         """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
+
+    def places(self, taken: Sequence[Signature], group: Sequence[Signature]) -> list[str]:
+        """Return the joints or bodies whose signatures gain beside ``taken`` and the others of a group."""
+        found = []
+        for place in dict.fromkeys(s.where for s in group):
+            rest = [s for s in group if s.where != place]
+            if self.gain([*taken, *rest], [s for s in group if s.where == place]) > EVIDENCE:
+                found.append(place)
+        return found
 
 
 def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Evidence:
@@ -154,17 +176,19 @@ def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Ev
     # A parameter at the end of its range cannot explain more.
     free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
     episodes = [problem.episodes[d.episode] for d in data]
+    names = [e.name for e in episodes]
+    found = signatures(problem, refined)
     return Evidence(
         rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
         prior=parameter_prior(problem),
-        found=signatures(problem, refined),
+        found=by_recording(found, [recording_of(name) for name in names]),
         answers=answers(problem, refined) if answered and problem.command_delays is None else (),
         period_s=problem.episodes[0].period_s,
         time_s=[
             np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
             for e, d in zip(episodes, data, strict=True)
         ],
-        names=[e.name for e in episodes],
+        names=names,
         searched=SearchedKinds.of(problem, refined.theta),
     )
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem, WindowData, samples_in
+from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros, zeros_of
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector
@@ -29,6 +31,7 @@ class HeldoutErrors:
         span: Range of each coordinate's signal, (n,) [rad or m].
         noise: Root mean square of the sensor's noise, estimated from the recordings, (n,) [rad or m]: a lower
             bound of the error. NaN for noise-free states.
+        zeros: Zeros of the recordings that were fitted to them, by predictor, joint and recording [rad or m].
     """
 
     names: tuple[str, ...]
@@ -38,6 +41,7 @@ class HeldoutErrors:
     units: tuple[str, ...]
     span: FloatArray
     noise: FloatArray
+    zeros: Mapping[str, Mapping[str, Mapping[str, float]]] = field(default_factory=dict)
 
     def mean(self) -> dict[str, float]:
         """Return the mean of :attr:`rmse` over the coordinates by predictor."""
@@ -49,7 +53,8 @@ class HeldoutErrors:
 
     def to_json(self) -> dict[str, Any]:
         """Return the errors in rad or m as plain JSON values; None where a prediction diverged."""
-        return {
+        zeros = {"zeros": self.zeros} if any(self.zeros.values()) else {}
+        return zeros | {
             "window_s": self.window_s,
             "mean": _plain(self.mean()),
             "pooled": _plain(self.pooled()),
@@ -76,7 +81,8 @@ class HeldOut:
 
     Predictions last ``window_s``, each from the smoothed reported state. ``truth`` holds noise-free positions
     at the episodes' samples, (T, n) each in the order of the measured coordinates; without it, the reported
-    ones are predicted.
+    ones are predicted. If the fitted recordings have zeros of their own, each candidate gets those of these
+    recordings, too, fitted to them.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -91,6 +97,10 @@ class HeldOut:
         threads: int | None = None,
         truth: Sequence[FloatArray] | None = None,
     ) -> None:
+        self._others: dict[tuple[str, ...], HeldOut] = {}
+        self._of = partial(HeldOut, robot, episodes=episodes, window_s=window_s, threads=threads, truth=truth)
+        self.space = space
+        space = with_other_zeros(space, robot.description, episodes)
         self.problem = problem = Problem(robot, space, episodes, threads=threads)
         self._window_s = window_s
         self._columns = columns = problem.channels[problem.channels < problem.coordinates]
@@ -109,8 +119,14 @@ class HeldOut:
             signal_range(problem.episodes[data.episode], reference, columns, robot.rotation)
             for data, reference in zip(self._windows, self._references, strict=True)
         ]
-        self._known: dict[tuple[bytes, float] | None, tuple[FloatArray, FloatArray]] = {}
+        self._known: dict[tuple[bytes, float] | None, tuple[FloatArray, FloatArray, FloatArray]] = {}
         self._simulate({None: None})
+
+    def of(self, space: ParameterSpace) -> HeldOut:
+        """Return the same recordings for candidates with these parameters."""
+        if space.names == self.space.names:
+            return self
+        return self._others.setdefault(space.names, self._others.get(space.names) or self._of(space))
 
     def errors(self, candidates: Mapping[str, tuple[FloatArray, float]]) -> HeldoutErrors:
         """Return the errors of candidates (parameters, (K,), and latency [s], by name) and of "null"."""
@@ -123,24 +139,27 @@ class HeldOut:
             self._simulate(fresh)
         found = {name: self._known[key] for name, key in {**keys, "null": None}.items()}
         span = np.maximum(np.max(self._spans, axis=0), 1e-300)
+        more = ParameterSpace(self.problem.space.free[len(self.space) :])
         return HeldoutErrors(
             names=tuple(self.problem.robot.coordinates[c] for c in self._columns),
             window_s=self._window_s,
-            nrmse={name: float(np.mean(rms / span)) for name, (rms, _) in found.items()},
-            rmse={name: rmse for name, (_, rmse) in found.items()},
+            nrmse={name: float(np.mean(rms / span)) for name, (rms, _, _) in found.items()},
+            rmse={name: rmse for name, (_, rmse, _) in found.items()},
             units=tuple(self.problem.robot.coordinate_units[c] for c in self._columns),
             span=span,
             noise=self._noise,
+            zeros={name: zeros_of(more, zeros) for name, (_, _, zeros) in found.items() if len(zeros)},
         )
 
     def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:
         """Store root mean squares, (n,), of all samples, and of the reported ones."""
         given = [fit for fit in fits.values() if fit is not None]
+        whole = [fitted_zeros(self.problem, *fit) for fit in given]
         squares, counts = np.zeros((2, len(fits), len(self._columns))), np.zeros(2)
         for data, reference, span in zip(self._windows, self._references, self._spans, strict=True):
             episode, sample = self.problem.episodes[data.episode], data.windows.samples()
             if given:
-                theta, latency = np.stack([fit[0] for fit in given]), np.array([fit[1] for fit in given])
+                theta, latency = np.stack(whole), np.array([fit[1] for fit in given])
                 predicted = self.problem.predict(theta, latency, data).position[..., self._columns]
             else:
                 predicted = _still(self.problem, data)[None, ..., self._columns]
@@ -153,7 +172,8 @@ class HeldOut:
             squares[1] += np.sum(np.where(np.isfinite(error), error, np.inf) ** 2, axis=1)
             counts[1] += np.count_nonzero(seen)
         rms = np.sqrt(squares / np.maximum(counts, 1)[:, None, None])
-        self._known.update(zip(fits, zip(rms[0], rms[1], strict=True), strict=True))
+        zeros = [theta[len(self.space) :] for theta in whole] if given else [np.empty(0)]
+        self._known.update(zip(fits, zip(rms[0], rms[1], zeros, strict=True), strict=True))
 
 
 def _still(problem: Problem, data: WindowData) -> FloatArray:

@@ -8,6 +8,7 @@ between joints counts. For a body, the mass itself is changed.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,7 +23,7 @@ from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
 Cause = Literal[
-    "friction", "backlash", "delay", "damping", "inertia", "lag", "load", "mass", "contact", "drive"
+    "friction", "backlash", "delay", "damping", "inertia", "lag", "load", "zero", "mass", "contact", "drive"
 ]
 
 
@@ -31,6 +32,9 @@ PUSH = 0.2
 
 HEAVIER = 0.02
 """Relative change of a mass [-]."""
+
+SHIFT = 0.01
+"""Change of an encoder's zero [rad or m]."""
 
 LOW_SPEEDS = (0.1, 0.4)
 """Speeds at which friction's excess at low speed falls to 1/e, as parts of a joint's rms speed [-]."""
@@ -53,11 +57,13 @@ class Signature:
         cause: The cause.
         where: Joint or body.
         columns: Change of the whitened predictions by each of n disturbances, per episode (W, H M, n).
+        unit: Unit of the disturbance, where it has one.
     """
 
     cause: Cause
     where: str
     columns: tuple[FloatArray, ...]
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +90,21 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
     )
     speed = np.sqrt(np.mean(moved**2, axis=0))
     found: dict[tuple[Cause, str], list[FloatArray]] = {}
-    heavier = masses(problem)
-    wide = problem.with_more(heavier)
+    heavier, shifted = masses(problem), zeros(problem)
+    more = [*heavier, *shifted]
+    wide, before = problem.with_more(more), np.array([p.nominal for p in more])
+    change = np.array([HEAVIER * p.nominal for p in heavier] + [SHIFT] * len(shifted))
     for e, data in enumerate(fit.shooting.data):
         x, v = fit.point.position[e], fit.point.velocity[e]
-        if heavier:
-            theta = np.repeat(
-                np.append(fit.theta, [p.nominal for p in heavier])[None], 1 + len(heavier), axis=0
-            )
-            theta[1:, len(fit.theta) :] *= 1 + HEAVIER * np.eye(len(heavier))
+        if more:
+            theta = np.repeat(np.append(fit.theta, before)[None], 1 + len(more), axis=0)
+            theta[1:, len(fit.theta) :] += np.diag(change)
             late = np.full(len(theta), fit.latency_s)
-            changed = wide.predict(theta, late, data, x, v).observed
-            for p, column in zip(heavier, whitened_changes(changed, data) / HEAVIER, strict=True):
-                found.setdefault(("mass", p.elements[0]), []).append(column[..., None])
+            changed = whitened_changes(wide.predict(theta, late, data, x, v).observed, data)
+            for p, column in zip(more, changed, strict=True):
+                cause: Cause = "mass" if p in heavier else "zero"
+                share = HEAVIER if p in heavier else SHIFT
+                found.setdefault((cause, p.elements[0]), []).append(column[..., None] / share)
         path = _path(problem, fit, data)
         position, velocity, acceleration = _along(problem, data, *states[data.episode])
         for name, c in zip(problem.robot.description.joint_names, range(C)[joints], strict=True):
@@ -120,7 +128,35 @@ def signatures(problem: Problem, fit: Refined) -> list[Signature]:
                 of_cause["backlash"] = np.concatenate([of_cause["backlash"], offset], axis=2)
             for cause, mine in of_cause.items():
                 found.setdefault((cause, name), []).append(mine)
-    return [Signature(cause, where, tuple(columns)) for (cause, where), columns in found.items()]
+    units = {p.elements[0]: p.unit for p in shifted}
+    return [
+        Signature(cause, where, tuple(columns), units[where] if cause == "zero" else "")
+        for (cause, where), columns in found.items()
+    ]
+
+
+def by_recording(found: Sequence[Signature], names: Sequence[str]) -> list[Signature]:
+    """Return signatures with the zero of each joint's encoder another one in each recording.
+
+    Args:
+        found: Signatures; those of a zero are the same in all recordings, and say little beside a load.
+        names: Name of the recording of each of their episodes.
+    """
+    recordings = list(dict.fromkeys(names))
+    others = [s for s in found if s.cause != "zero"]
+    if len(recordings) < 2:
+        return others
+    return others + [
+        Signature(
+            "zero",
+            s.where,
+            tuple(c if name == own else np.zeros_like(c) for name, c in zip(names, s.columns, strict=True)),
+            s.unit,
+        )
+        for s in found
+        if s.cause == "zero"
+        for own in recordings
+    ]
 
 
 def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
@@ -265,6 +301,16 @@ def masses(problem: Problem) -> list[Parameter]:
         for body in map(model.body, range(1, model.nbody))
         if model.body_weldid[body.id] and body.mass[0] > 0 and body.name and body.name not in taken
     ]
+
+
+def zeros(problem: Problem) -> list[Parameter]:
+    """Return the encoders' zeros of a fixed-base robot that are neither searched nor known."""
+    if problem.robot.base is not None:
+        return []
+    taken = {e for p in problem.space.parameters if p.kind == "encoder_bias" for e in p.elements}
+    facts = problem.robot.description
+    joints = zip(facts.joint_names, facts.position_units, strict=True)
+    return [Parameter.encoder_bias(j, 10 * SHIFT, unit=unit) for j, unit in joints if j not in taken]
 
 
 def _inertia(problem: Problem, coordinate: int) -> float:

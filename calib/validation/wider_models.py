@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.parts import BEGIN_S, part_of
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -86,15 +86,25 @@ class Gain:
     before: float
 
 
-def fit_wider(problem: Problem, more: Sequence[Parameter]) -> WiderFit | None:
-    """Fit with more parameters to a part of the recordings; None where it cannot be fitted."""
+def fit_wider(
+    problem: Problem, more: Sequence[Parameter], seconds: float = BEGIN_S, start: Member | None = None
+) -> WiderFit | None:
+    """Fit with more parameters to a part of the recordings; None where it cannot be fitted.
+
+    Args:
+        problem: The recordings.
+        more: The further parameters.
+        seconds: Length of the part [s], if it is longer than :data:`BEGIN_S`; at most half of the recordings.
+        start: Where the fit begins; the model's own values by default.
+    """
     wide = problem.with_more(more)
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
-    part = part_of(wide, min(BEGIN_S, total_s / 2))
+    part = part_of(wide, min(max(BEGIN_S, seconds), total_s / 2))
     seen = [e.usable for e in part.episodes]
     rest = [e.usable & ~mask for e, mask in zip(problem.episodes, seen, strict=True)]
+    theta, latency_s = start or (wide.space.nominal, problem.first_latency_s)
     try:
-        fit = refine(part, wide.space.nominal, problem.first_latency_s, (WINDOW_S,))
+        fit = refine(part, theta, latency_s, (WINDOW_S,))
         length = samples_in(problem, WINDOW_S)
         prediction = at_parameters(wide.part(rest), fit.theta, fit.latency_s, length)
     except (InsufficientDataError, CalibrationError):

@@ -25,6 +25,7 @@ from deal_hw.bench.settings import FirstAnswer
 from deal_hw.calibration import Budget, Progress
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, UnknownNameError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
@@ -260,13 +261,14 @@ class _Stopwatch:
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """An intermediate fit: stage, wall clock and processor time [s], values (K,), latency [s]."""
+    """An intermediate fit: stage, wall clock and processor time [s], values (K,), latency [s], parameters."""
 
     stage: str
     wall_s: float
     cpu_s: float
     theta: FloatArray
     latency_s: float
+    space: ParameterSpace
 
 
 def _compared(
@@ -293,8 +295,9 @@ def _compared(
 
     def watch(progress: Progress) -> None:
         if progress.estimate is not None:
-            latency_s = progress.latency_s or 0.0
-            shown.append(_Shown(progress.stage, *since.passed(), progress.estimate.copy(), latency_s))
+            theta, latency_s = progress.estimate.copy(), progress.latency_s or 0.0
+            space = progress.space or work.space
+            shown.append(_Shown(progress.stage, *since.passed(), theta, latency_s, space))
 
     result = calibrate_episodes(
         work.robot,
@@ -307,7 +310,7 @@ def _compared(
         threads=threads,
         progress=watch,
     )
-    shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s))
+    shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s, result.space))
 
     # Whole recordings, as far as they are fitted: its windows must not end where ours were cut.
     whole = Problem(work.robot, work.space, joined(work.episodes), threads=threads)
@@ -317,11 +320,12 @@ def _compared(
     )
     sysid_s, sysid_cpu_s = since.passed()
 
-    fits = {str(i): (fit.theta, fit.latency_s) for i, fit in enumerate(shown)}
-    fits |= {"sysid": (sysid.estimate, sysid.latency_s), "nominal": (work.space.nominal, 0.0)}
-    judged = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads).errors(fits)
-    errors = judged.mean()
-    ours = [errors[str(i)] for i in range(len(shown))]
+    held_out = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads)
+    fits = {"sysid": (sysid.estimate, sysid.latency_s), "nominal": (work.space.nominal, 0.0)}
+    errors = held_out.errors(fits).mean()
+    ours = []
+    for fit in shown:
+        ours.append(held_out.of(fit.space).errors({"fit": (fit.theta, fit.latency_s)}).mean()["fit"])
     first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= NEAR * ours[-1])
     return {
         "method": method,

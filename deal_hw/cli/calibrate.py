@@ -188,10 +188,8 @@ def calibrate(config: Calibrate) -> CalibrateReport:
     with _without_windows():
         work = calibration_input(config, say=say)
     method = usual_method(config, work, say)
-    from deal_hw.sim.parameters import present
-
     # What is shown is the robot without set-up.
-    shown = present(work.space, work.robot.absent)
+    shown = work.robot.acting(work.space)
     with (
         results.resumable(),
         watching(

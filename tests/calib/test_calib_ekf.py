@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.baselines.ekf import Ekf, EkfSettings, ExtendedKalman, one_pass
-from deal_hw.calib.data.problem import Problem, taken
+from deal_hw.calib.data.parts import taken
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import SearchCheckpoint
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.description import DESCRIPTION

@@ -109,7 +109,8 @@ def test_units_and_noise_stand_beside_the_gain() -> None:
 
 
 def test_percent_has_two_digits() -> None:
-    """Also above 100 %."""
+    """Also above 100 %, and few where a prediction diverged."""
+    assert percent(2e300) == "2e+302\u00a0%"
     assert [percent(v) for v in (0.0012345, 0.5, 2.34)] == ["0.12\u00a0%", "50\u00a0%", "234\u00a0%"]
 
 

@@ -11,12 +11,13 @@ import pytest
 from fakes.sine_arm import MJCF
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool
 from deal_hw.sim.engine.model import RobotModel, at_step, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.parameters.yaml_space import parse_space
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.sim.recordings.own_setups import in_own_setups, own_setup
 from deal_hw.sim.recordings.setups import Setups, parse_setups, read_setups, with_setups
 
 JOINTS = ("yaw", "pitch", "elbow")
@@ -112,6 +113,48 @@ def test_another_mjcf_is_a_setup(robot: RobotModel, tmp_path: Path) -> None:
     assert found.model.body("lower").pos[2] == 0.35 and found.description == robot.description
 
 
+def test_the_zero_of_a_setup_acts_in_its_recordings_only(robot: RobotModel) -> None:
+    """Of the joints that its patterns match; the model itself has none."""
+    setups = parse_setups("setups: {a: {recordings: r1, encoder_bias: {pitch: 0.2, 'e*': 0.1}}}")
+    whole = setups.robot(robot, _space(robot))
+    space = with_setups(_space(robot), whole, setups)
+    assert space.names == ("lower.mass", "pitch.encoder_bias@a", "elbow.encoder_bias@a")
+    assert (space["elbow.encoder_bias@a"].low, space["elbow.encoder_bias@a"].high) == (-0.1, 0.1)
+    pool = BatchPool(whole, space, threads=1)
+    for name, reported in (("a", [0.0, 0.15, -0.05]), ("", [0.0, 0.0, 0.0])):
+        batch = pool.get(1, name)
+        batch.set_parameters(np.array([[0.5, 0.15, -0.05]]))
+        np.testing.assert_allclose(batch.position[0], reported)
+
+
+def test_two_zeros_of_one_joint_are_refused(robot: RobotModel) -> None:
+    """One of all recordings, and another one of a set-up."""
+    setups = parse_setups("setups: {a: {recordings: r1, encoder_bias: {'*': 0.2}}}")
+    space = _space(robot, "{kind: encoder_bias, elements: elbow, range: [-0.1, 0.1]}")
+    with pytest.raises(ConfigurationError, match="both set encoder_bias of 'elbow'; keep one"):
+        with_setups(space, setups.robot(robot, space), setups)
+
+
+def test_a_recording_with_parameters_of_its_own_is_a_setup(robot: RobotModel) -> None:
+    """Its parts between gaps share it, and the set-up in which it was made goes on to act."""
+    setups = parse_setups("setups: {a: {recordings: r1, encoder_bias: {pitch: 0.2}}}")
+    whole = setups.robot(robot, _space(robot))
+    zero = Parameter.encoder_bias("elbow", 0.1, setup=own_setup("r1.csv"))
+    space = ParameterSpace([*with_setups(_space(robot), whole, setups), zero])
+    assert zero.name == "elbow.encoder_bias@r1.csv"
+    names = ["r1.csv, part 1 of 2", "r1.csv, part 2 of 2", "r2.csv"]
+    found, episodes = in_own_setups(
+        whole, [setups.with_gains(_episode(name), robot) for name in names], space
+    )
+    assert [e.setup for e in episodes] == ["@r1.csv", "@r1.csv", ""]
+    acting = [p.name for p in found.in_setup("@r1.csv").acting(space).free if p.elements]
+    assert acting == ["lower.mass", "pitch.encoder_bias@a", "elbow.encoder_bias@r1.csv"]
+    assert [p.name for p in found.acting(space).free if p.elements] == ["lower.mass"]
+    # Once more changes nothing, and without such parameters nothing is changed at all.
+    assert in_own_setups(found, episodes, space)[1] == episodes
+    assert in_own_setups(whole, episodes, _space(robot)) == (whole, episodes)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -125,6 +168,7 @@ def test_another_mjcf_is_a_setup(robot: RobotModel, tmp_path: Path) -> None:
         ("setups: {a: {recordings: x, payload: {body: b, mass: 200 g}}}", "payload's mass"),
         ("setups: {a: {recordings: x, payload: {body: b, at: 0.1}}}", "`at` must be a list of 3 numbers"),
         ("setups: {a: {recordings: x, stiffness: 12}}", "a value for each joint or pattern"),
+        ("setups: {'@a': {recordings: x}}", "must not begin with '@'"),
         (
             "setups: {a: {recordings: x, payload: {body: b, mass: 0.2}}, "
             "b: {recordings: y, payload: {body: b, mass: 0.3}}}",
@@ -184,10 +228,11 @@ def test_setups_that_contradict_the_model_are_refused(
         ("{a: {recordings: 'r*'}, b: {recordings: r1}}", "a and b both claim recording r1.csv"),
         ("{a: {recordings: q}}", "no recording belongs to set-up 'a'"),
         ("{a: {recordings: r1, stiffness: {wrist: 3}}}", "unknown joint 'wrist'"),
+        ("{a: {recordings: r1, encoder_bias: {wrist: 0.1}}}", "unknown joint 'wrist'"),
     ],
 )
 def test_setups_that_do_not_fit_the_recordings_are_refused(robot: RobotModel, text: str, words: str) -> None:
-    """Two claims, none, or gains of no servo."""
+    """Two claims, none, gains of no servo, or a zero of no joint."""
     with pytest.raises(ConfigurationError) as caught:
         parse_setups(f"setups: {text}").check_used(["r1.csv", "r2.csv"], robot.description)
     assert words in str(caught.value)

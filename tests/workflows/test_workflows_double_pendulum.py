@@ -12,6 +12,7 @@ from deal_hw.data.checks.command_kind import command_kind
 from deal_hw.data.importing.columns import read_column_map
 from deal_hw.data.importing.load import load_tables
 from deal_hw.findings import Severity
+from deal_hw.sim.recordings.setups import read_setups
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "double_pendulum"
 HEADER = (
@@ -37,3 +38,12 @@ def test_the_double_pendulum(tmp_path: Path) -> None:
     assert table.position == pytest.approx(np.array(rows)[:, 1:3])
     assert table.target == pytest.approx(np.array(rows)[:, 9:11])
     assert command_kind(table, servo=False).severity is not Severity.FAIL
+
+
+def test_each_fitted_recording_has_its_zeros() -> None:
+    """The page's set-ups name its recordings, whose zeros are searched at both joints."""
+    setups = read_setups(FOLDER / "zeros.yaml")
+    names = [f"trajectory_0{k}.csv" for k in (0, 1, 3, 5)]
+    assert [setups.of(name) for name in names] == ["00", "01", "03", "05"]
+    assert setups.of("trajectory_02.csv") == ""
+    assert all(setup.encoder_bias == {"*": 0.3} for setup in setups.setups.values())

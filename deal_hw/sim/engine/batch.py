@@ -24,7 +24,7 @@ from deal_hw.sim.engine.model import RobotModel, drop_filters
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.laws.commands import NEUTRAL, CommandLaws, Filters
-from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters, present
+from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
 from deal_hw.sim.parameters.values import KindValues, spread, values_by_kind
 from deal_hw.types import FloatArray
 
@@ -121,7 +121,7 @@ class ServoBatch:
     ) -> None:
         self.robot = robot
         self.space = space
-        self._here = present(space, robot.absent)
+        self._here = robot.acting(space)
         self.effort_joints = effort_joints(robot.description, space)
         self.count = count
         self._filters, model = robot.filters, robot.model

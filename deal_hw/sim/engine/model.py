@@ -39,6 +39,7 @@ class RobotModel:
         base: Where the floating base's entries begin in qpos and qvel; None for a fixed base.
         setups: The robot in other set-ups, such as with a payload, by their names.
         absent: Type and name of elements that other set-ups have, and this model lacks.
+        own: Names of the set-ups whose own parameters act here.
     """
 
     description: RobotDescription
@@ -49,10 +50,15 @@ class RobotModel:
     base: tuple[int, int] | None = None
     setups: Mapping[str, RobotModel] = field(default_factory=dict)
     absent: frozenset[tuple[str, str]] = frozenset()
+    own: frozenset[str] = frozenset()
 
     def in_setup(self, name: str) -> RobotModel:
         """Return the robot in a set-up; "" is the model itself."""
         return self.setups[name] if name else self
+
+    def acting(self, space: ParameterSpace) -> ParameterSpace:
+        """Return the parameters, those that act on this model with their elements, the others with none."""
+        return present(space, self.absent, self.own)
 
     @property
     def actuator_names(self) -> tuple[str, ...]:
@@ -205,8 +211,9 @@ def at_step(robot: RobotModel, step_s: float) -> RobotModel:
 def model_with(robot: RobotModel, space: ParameterSpace, theta: FloatArray) -> mujoco.MjModel:
     """Return a copy of the model with the parameters set, (K,)."""
     model = copy.copy(robot.model)
-    here = present(space, robot.absent)
-    apply_parameters(ModelFields(model, robot.model), here, np.asarray(theta, dtype=float)[None])
+    apply_parameters(
+        ModelFields(model, robot.model), robot.acting(space), np.asarray(theta, dtype=float)[None]
+    )
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 

@@ -23,7 +23,6 @@ from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.batch import COMMAND_KINDS
 from deal_hw.sim.engine.model import RobotModel, model_with
 from deal_hw.sim.mjcf.bam import BAM, bam_parameters, drive_texts, parameter_texts
-from deal_hw.sim.parameters import present
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.inertia import INERTIA_KINDS
@@ -236,7 +235,7 @@ def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
             row = _actuator(robot, model, result, description.actuated.index(joint))
             limit["effort"], damping = row["effort_limit"], row["joint_damping"]
         joints[joint] = {"dynamics": {"damping": damping, "friction": friction}, "limit": limit}
-    moved = [p for p in present(result.space, robot.absent).parameters if p.kind in _BODY_KINDS]
+    moved = [p for p in robot.acting(result.space).parameters if p.kind in _BODY_KINDS]
     bodies = dict.fromkeys(name for parameter in moved for name in parameter.elements)
     return {
         "format": "deal_hw.urdf/1",

@@ -164,21 +164,25 @@ def _check_bounds(p: Parameter, kind: Kind) -> None:
         raise ConfigurationError(f"parameter {p.name!r} names no {kind.element}; list its `elements`")
 
 
-def present(space: ParameterSpace, absent: Collection[tuple[str, str]]) -> ParameterSpace:
+def present(
+    space: ParameterSpace, absent: Collection[tuple[str, str]], own: Collection[str] = ()
+) -> ParameterSpace:
     """Return the parameters without elements that are in another set-up only; some may have none.
 
     Args:
         space: The parameters.
         absent: Type and name of elements that a model lacks, such as ("body", "payload").
+        own: Set-ups whose own parameters act.
     """
-    if not absent:
+    if not absent and not any(p.setup for p in space.parameters):
         return space
-    return ParameterSpace(
-        dataclasses.replace(
-            p, elements=tuple(e for e in p.elements if (find_kind(p.kind).element, e) not in absent)
-        )
-        for p in space.parameters
-    )
+
+    def here(p: Parameter) -> tuple[str, ...]:
+        if p.setup and p.setup not in own:
+            return ()
+        return tuple(e for e in p.elements if (find_kind(p.kind).element, e) not in absent)
+
+    return ParameterSpace(dataclasses.replace(p, elements=here(p)) for p in space.parameters)
 
 
 def apply_parameters(fields: Fields, space: ParameterSpace, theta: Array) -> None:

@@ -24,16 +24,17 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, actuator_of
-from deal_hw.sim.parameters import KIND_TABLE, check_space, present
+from deal_hw.sim.parameters import KIND_TABLE, check_space
 from deal_hw.sim.parameters.fields import ELEMENTS, element_id, element_names, unknown_name
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.sim.recordings.own_setups import OWN, recording_of
 
 FILE: Final = "setups.yaml"
 """Name of the file in a dataset's folder."""
 BASE: Final = "model"
 """Name of the robot as its MJCF has it: recordings of no set-up."""
 
-_KEYS: Final = ("recordings", "mjcf", "payload", "stiffness", "damping")
+_KEYS: Final = ("recordings", "mjcf", "payload", "stiffness", "damping", "encoder_bias")
 _PAYLOAD_KEYS: Final = ("body", "name", "at", "mass", "range", "radius")
 _GAINS: Final = ("stiffness", "damping")
 _RADIUS_M: Final = 0.02
@@ -91,6 +92,8 @@ class Setup:
         stiffness: Gains that the host or the servo had, by actuated joint or pattern; others are the
             recordings' own.
         damping: Likewise.
+        encoder_bias: Largest offset of a joint's zero in these recordings, by joint or pattern [rad or m]:
+            such joints get a bias of their own here, which is searched to both sides.
     """
 
     name: str
@@ -99,6 +102,16 @@ class Setup:
     payload: tuple[Payload, ...] = ()
     stiffness: Mapping[str, float] = field(default_factory=dict)
     damping: Mapping[str, float] = field(default_factory=dict)
+    encoder_bias: Mapping[str, float] = field(default_factory=dict)
+
+    def biases(self, description: RobotDescription) -> list[Parameter]:
+        """Return the searched zeros of its recordings."""
+        found = dict[str, Parameter]()
+        for pattern, most in self.encoder_bias.items():
+            for joint, unit in zip(description.joint_names, description.position_units, strict=True):
+                if fnmatch.fnmatchcase(joint, pattern):
+                    found[joint] = Parameter.encoder_bias(joint, most, unit=unit, setup=self.name)
+        return list(found.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +126,11 @@ class Setups:
     setups: Mapping[str, Setup]
     source: str
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """The unknown payload masses, each once."""
+    def parameters(self, description: RobotDescription) -> tuple[Parameter, ...]:
+        """Return the unknown payload masses, each once, and the zeros of single set-ups."""
         found = {p.name: p for s in self.setups.values() for p in s.payload if p.mass is None}
-        return tuple(payload.parameter for payload in found.values())
+        biases = [p for s in self.setups.values() for p in s.biases(description)]
+        return (*(payload.parameter for payload in found.values()), *biases)
 
     def of(self, recording: str) -> str:
         """Return the name of a recording's set-up; "" for none.
@@ -156,7 +169,7 @@ class Setups:
         every = base.union(*own.values())
         return dataclasses.replace(
             robot,
-            setups={name: _robot_of(robot, model, every - own[name]) for name, model in models.items()},
+            setups={name: _robot_of(robot, name, model, every - own[name]) for name, model in models.items()},
             absent=every - base,
         )
 
@@ -199,9 +212,11 @@ class Setups:
                     f"{self.source}, set-up {setup.name!r}: motors that take efforts have no gains; remove "
                     "`stiffness` and `damping`"
                 )
-            for pattern in (*setup.stiffness, *setup.damping):
-                if not any(fnmatch.fnmatchcase(joint, pattern) for joint in joints):
-                    error = unknown_name("joint", pattern, joints)
+            given = [(p, joints) for p in (*setup.stiffness, *setup.damping)]
+            given += [(p, description.joint_names) for p in setup.encoder_bias]
+            for pattern, known in given:
+                if not any(fnmatch.fnmatchcase(joint, pattern) for joint in known):
+                    error = unknown_name("joint", pattern, known)
                     error.args = (f"{self.source}, set-up {setup.name!r}: {error}",)
                     raise error
 
@@ -276,6 +291,8 @@ def parse_setups(text: str, source: str = FILE, folder: Path = Path()) -> Setups
         raise ConfigurationError(f"{source}: `setups` must have at least one name with its set-up")
     found: dict[str, Setup] = {}
     for name, entry in entries.items():
+        if str(name).startswith(OWN):
+            raise ConfigurationError(f"{source}: set-up {str(name)!r}: a name must not begin with {OWN!r}")
         try:
             found[str(name)] = _setup(str(name), entry, folder)
         except ConfigurationError as err:
@@ -303,7 +320,7 @@ def _setup(name: str, entry: Any, folder: Path) -> Setup:
         recordings=tuple(map(str, listed)),
         mjcf=None if mjcf is None else folder / mjcf,
         payload=tuple(map(_payload, payload if isinstance(payload, list) else [payload])),
-        **{gain: _gains(entry.get(gain, {}), gain) for gain in _GAINS},
+        **{key: _gains(entry.get(key, {}), key) for key in (*_GAINS, "encoder_bias")},
     )
 
 
@@ -355,7 +372,9 @@ def _elements(model: mujoco.MjModel) -> frozenset[tuple[str, str]]:
     return frozenset((kind, name) for kind in ELEMENTS for name in element_names(model, kind))
 
 
-def _robot_of(robot: RobotModel, model: mujoco.MjModel, absent: frozenset[tuple[str, str]]) -> RobotModel:
+def _robot_of(
+    robot: RobotModel, name: str, model: mujoco.MjModel, absent: frozenset[tuple[str, str]]
+) -> RobotModel:
     """Return the robot with another model of the same joints and actuators."""
     description = robot.description
     joints = [element_id(model, "joint", name) for name in description.joint_names]
@@ -373,6 +392,7 @@ def _robot_of(robot: RobotModel, model: mujoco.MjModel, absent: frozenset[tuple[
         base=base,
         setups={},
         absent=absent,
+        own=frozenset({name}),
     )
 
 
@@ -382,9 +402,9 @@ def with_setups(space: ParameterSpace, robot: RobotModel, setups: Setups) -> Par
     Raises:
         ConfigurationError: A parameter has no element in any set-up.
     """
-    found = ParameterSpace([*space.parameters, *setups.parameters])
+    found = ParameterSpace([*space.parameters, *setups.parameters(robot.description)])
     for name, variant in robot.setups.items():
-        part = ParameterSpace(p for p in present(found, variant.absent).parameters if p.elements)
+        part = ParameterSpace(p for p in variant.acting(found).parameters if p.elements)
         try:
             check_space(variant.model, part)
         except ConfigurationError as err:
@@ -395,7 +415,7 @@ def with_setups(space: ParameterSpace, robot: RobotModel, setups: Setups) -> Par
 
 def _names_of(recording: str) -> tuple[str, ...]:
     """Return the names by which a recording may be called: its file's, its stem, an episode's number."""
-    file = recording.partition(", part ")[0]
+    file = recording_of(recording)
     stem = Path(file).stem
     number_of = (str(int(stem)),) if stem.isdigit() else ()
     return (recording, file, Path(file).name, stem, *number_of)

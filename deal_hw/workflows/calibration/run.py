@@ -149,8 +149,8 @@ class BestSoFar:
 
     Args:
         space: The parameters.
-        judge: Returns the held-out errors of a fit, (K,) and latency [s], as "calibrated", beside "nominal"
-        and "null"; None without held-out data.
+        judge: Returns the held-out errors of a fit, (K,) and latency [s] with its parameters, as
+            "calibrated", beside "nominal" and "null"; None without held-out data.
         say: Called with a sentence on each fit whose error is 5 % lower than the one reported before, and
             with each message before the search.
         progress: Called with the progress, too; None: nobody else is.
@@ -159,7 +159,7 @@ class BestSoFar:
     def __init__(
         self,
         space: ParameterSpace,
-        judge: Callable[[FloatArray, float], Mapping[str, float]] | None,
+        judge: Callable[[FloatArray, float, ParameterSpace], Mapping[str, float]] | None,
         say: Say = silent,
         progress: ProgressCallback | None = None,
     ) -> None:
@@ -180,12 +180,13 @@ class BestSoFar:
     def _compare(self, progress: Progress, estimate: FloatArray) -> None:
         """Compare a fit with the best one so far."""
         latency_s = progress.latency_s or 0.0
-        errors = self._judge(estimate, latency_s) if self._judge is not None else {}
+        space = progress.space or self._space
+        errors = self._judge(estimate, latency_s, space) if self._judge is not None else {}
         error = errors.get("calibrated", progress.values.get("chi2", math.inf))
         if self.result is not None and not error < self._error:
             return
         self._error = error
-        space = self._space.holding(estimate)
+        space = space.holding(estimate)
         low_high = np.stack([space.low, space.high], axis=1)
         self.result = CalibrationResult(
             method=f"interrupted after {progress.stage}",
@@ -374,11 +375,12 @@ def calibrate_episodes(
     held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
 
     def errors(of: HeldOut, theta: FloatArray, latency: float) -> HeldoutErrors:
-        nominal = of.problem.space.nominal
-        return of.errors({"nominal": (nominal, 0.0), "calibrated": (theta, latency)})
+        return of.errors({"nominal": (of.space.nominal, 0.0), "calibrated": (theta, latency)})
 
-    judge = None if held_out is None else lambda *fit, of=held_out: errors(of, *fit).nrmse
-    best = BestSoFar(space, judge, say, progress)
+    def judge(theta: FloatArray, latency: float, of: ParameterSpace) -> Mapping[str, float]:
+        return {} if held_out is None else errors(held_out.of(of), theta, latency).nrmse
+
+    best = BestSoFar(space, None if held_out is None else judge, say, progress)
     searcher = make_method(method, refine=budget.refine, thorough=thorough, laws=laws)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
@@ -407,10 +409,8 @@ def calibrate_episodes(
     result = dataclasses.replace(result, alarms=alarms, provenance=provenance)
     if held_out is None:
         return result
-    if len(result.space) > len(space):
-        # Play in the gears became a parameter.
-        held_out = HeldOut(robot, result.space, holdout, heldout_window_s, threads)
-    found = errors(held_out, result.estimate, result.latency_s)
+    # Laws and zeros of single recordings became parameters.
+    found = errors(held_out.of(result.space), result.estimate, result.latency_s)
     provenance = {**result.provenance, "heldout_rmse": found.to_json()}
     return dataclasses.replace(result, heldout_nrmse=found.nrmse, provenance=provenance)
 
