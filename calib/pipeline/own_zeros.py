@@ -65,7 +65,7 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
 
     problem, names = run.problem, recordings_of(run.problem.episodes)
     shared = [] if problem.noise_free else zeros(problem)
-    if not (run.settings.laws and shared and len(names) > 1):
+    if not (run.settings.laws and shared):
         return None
     with run.check(OWN_ZEROS):
         known = evidence(problem, with_rows(local), answered=False)

@@ -19,6 +19,7 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.inverse_dynamics import link_torques
 from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.recordings.own_setups import recording_of
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
@@ -304,8 +305,9 @@ def masses(problem: Problem) -> list[Parameter]:
 
 
 def zeros(problem: Problem) -> list[Parameter]:
-    """Return the encoders' zeros of a fixed-base robot that are neither searched nor known."""
-    if problem.robot.base is not None:
+    """Return the encoders' zeros of a fixed-base robot in several recordings that no parameter sets."""
+    # In a single recording a zero is one of all, which looks like a load.
+    if problem.robot.base is not None or len({recording_of(e.name) for e in problem.episodes}) < 2:
         return []
     taken = {e for p in problem.space.parameters if p.kind == "encoder_bias" for e in p.elements}
     facts = problem.robot.description

@@ -66,7 +66,10 @@ def test_play_is_found_and_measured() -> None:
 
 @pytest.mark.slow
 def test_play_that_explains_all_becomes_a_parameter() -> None:
-    """No search follows; the result has the play, the true values, and one alarm."""
+    """No search follows; the result has the play, the true values, and one alarm.
+
+    The search that is not needed is long enough to try play in its place.
+    """
     robot, problem, _ = truth("pendulum", "backlash")
     result = calibrate_episodes(
         problem.robot,
@@ -74,7 +77,7 @@ def test_play_that_explains_all_becomes_a_parameter() -> None:
         problem.episodes,
         problem.episodes[:1],
         method="default",
-        budget=Budget(population=8, generations=2),
+        budget=Budget(population=20, generations=5),
         rng=np.random.default_rng(0),
         threads=1,
     )
