@@ -159,6 +159,7 @@ class Shooting:
             with_command_delays(problem, problem.windows(length)) if data is None else data
         )
         self.length = length
+        self._acts = [problem.acts(d.episode) for d in self.data]
         # The last point whose predictions are known, and these: (W, H, M) an episode.
         self._known: tuple[Point | None, list[FloatArray]] = (None, [])
         space = problem.space
@@ -283,7 +284,7 @@ class Shooting:
                 v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
             # Row n of `values`, `x` and `v` has entry n of (p, s_w) changed by its step, in all windows at
             # once: windows do not share start states.
-            acting = np.append(self.problem.acts(data.episode), np.ones(1 + 2 * moved, dtype=bool))
+            acting = np.append(self._acts[e], np.ones(1 + 2 * moved, dtype=bool))
             acting[: K + 1] &= not states_only
             predicted = self._predict(values[acting], data, x[acting], v[acting]).observed
             r = data.whitened(base[e] - data.measured)

@@ -17,6 +17,7 @@ from deal_hw.calib.fit.refinement import Refined, local_fit
 from deal_hw.calib.pipeline.calibration_run import OWN_ZEROS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.minima import conclusive
 from deal_hw.findings import Finding
+from deal_hw.sim.recordings.own_setups import recordings_of
 
 if TYPE_CHECKING:
     from deal_hw.calib.validation.cause_words import Diagnosis
@@ -59,21 +60,21 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
     from deal_hw.calib.validation.diagnosis import POOR
     from deal_hw.calib.validation.evidence import evidence
     from deal_hw.calib.validation.explain import DECISIVE
-    from deal_hw.calib.validation.recording_zeros import named_zeros, own_zeros, recordings_of, zeros_of
+    from deal_hw.calib.validation.recording_zeros import named_zeros, own_zeros, zeros_of
     from deal_hw.calib.validation.signatures import zeros
     from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost
 
-    problem, names = run.problem, recordings_of(run.problem.episodes)
+    problem, names = run.problem, recordings_of(e.name for e in run.problem.episodes)
     shared = [] if problem.noise_free else zeros(problem)
     if not (run.settings.laws and shared):
         return None
     with run.check(OWN_ZEROS):
         known = evidence(problem, with_rows(local), answered=False)
         share, joints = _share(known)
-        units = {p.elements[0]: p.unit for p in shared if p.elements[0] in joints}
-        more = own_zeros(units, names)
         if share < DECISIVE or local.chi2 * (1 - share) > POOR:
             return None
+        units = {p.elements[0]: p.unit for p in shared if p.elements[0] in joints}
+        more = own_zeros(units, names)
         if not run.may_try(OWN_ZEROS, wider_cost(problem, True, len(units))):
             return None
         run.say(OWN_ZEROS, "does a zero of its own in each recording predict motion that was not fitted?")

@@ -136,7 +136,7 @@ def gather(
         shown = group[: max(min(MOST_PANELS // len(group[0].channels), len(group)), 1)]
         if len(group) > len(shown):
             left_out.append(f"{len(group) - len(shown)} more {word} recordings are not drawn")
-        space = with_other_zeros(result.space, robot.description, shown)
+        space = with_other_zeros(result.space, shown)
         problem = Problem(robot, space, shown, threads=threads, fixed_latency_s=result.latency_s)
         each = zip(theta, latency_s, strict=True)
         members = np.stack([fitted_zeros(problem, values, float(late)) for values, late in each])

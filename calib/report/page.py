@@ -338,7 +338,7 @@ def model_distribution(robot: RobotModel, result: CalibrationResult) -> Paramete
     here = robot.acting(result.space)
     sensors = [kind.name for kind in EFFORT_KINDS]
     idle = (p.name for p in here.parameters if not p.elements or p.kind in sensors)
-    more = next_zeros(robot.description, result.space, result.estimate)
+    more = next_zeros(result.space, result.estimate)
     return result.distribution().without(idle).with_more(*more)
 
 

@@ -318,15 +318,17 @@ def _zero_diagnosis(
     """Name the zero of each recording, of the joints that need their own ones beside the others."""
     # The residual is prediction minus measurement: a zero moves against its coefficient.
     values = -known.coefficients([*taken, *group])[-len(group) :]
-    found: dict[str, str] = {}
-    joints = known.places(taken, group) or list(dict.fromkeys(s.where for s in group))
+    units = {s.where: s.unit for s in group}
+    joints, found = known.places(taken, group) or list(units), list[str]()
     for joint in joints:
-        mine = [s.where == joint for s in group]
-        each = dict(zip(known.recordings, map(float, values[mine]), strict=True))
-        found[joint] = named_zeros(joint, group[mine.index(True)].unit, each)
+        mine = values[[s.where == joint for s in group]]
+        each = dict(zip(known.recordings, map(float, mine), strict=True))
+        found.append(named_zeros(joint, units[joint], each))
     looks, means, do = LOOKS["zero"]
-    seen = f"{percent(share)} of the squared residual on left-out motion looks like {looks}: zero."
-    seen = f"{seen} {'; '.join(found.values())}."
+    seen = (
+        f"{percent(share)} of the squared residual on left-out motion looks like {looks}: zero. "
+        f"{'; '.join(found)}."
+    )
     alarm = Finding.alarm(seen, means, do.replace("{}", listed(joints)))
     return Diagnosis.of("zero", share, deviance, joints, alarm)
 

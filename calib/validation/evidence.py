@@ -26,7 +26,7 @@ from deal_hw.calib.validation.signatures import (
     by_recording,
     signatures,
 )
-from deal_hw.sim.recordings.own_setups import recording_of
+from deal_hw.sim.recordings.own_setups import recordings_of
 from deal_hw.types import FloatArray
 
 FOLDS = 4
@@ -70,7 +70,7 @@ class Evidence:
     @property
     def recordings(self) -> list[str]:
         """Names of the recordings, each once; parts between gaps are of one."""
-        return list(dict.fromkeys(map(recording_of, self.names)))
+        return recordings_of(self.names)
 
     @cached_property
     def _following(self) -> list[FloatArray]:
@@ -177,11 +177,10 @@ def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Ev
     free = np.append(~ended_at_bound(space, refined.theta), problem.fixed_latency_s is None)
     episodes = [problem.episodes[d.episode] for d in data]
     names = [e.name for e in episodes]
-    found = signatures(problem, refined)
     return Evidence(
         rows=[dataclasses.replace(r, parameter=r.parameter * free) for r in refined.normal.rows],
         prior=parameter_prior(problem),
-        found=by_recording(found, [recording_of(name) for name in names]),
+        found=by_recording(signatures(problem, refined), names),
         answers=answers(problem, refined) if answered and problem.command_delays is None else (),
         period_s=problem.episodes[0].period_s,
         time_s=[

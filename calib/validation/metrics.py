@@ -100,7 +100,7 @@ class HeldOut:
         self._others: dict[tuple[str, ...], HeldOut] = {}
         self._of = partial(HeldOut, robot, episodes=episodes, window_s=window_s, threads=threads, truth=truth)
         self.space = space
-        space = with_other_zeros(space, robot.description, episodes)
+        space = with_other_zeros(space, episodes)
         self.problem = problem = Problem(robot, space, episodes, threads=threads)
         self._window_s = window_s
         self._columns = columns = problem.channels[problem.channels < problem.coordinates]
@@ -126,7 +126,9 @@ class HeldOut:
         """Return the same recordings for candidates with these parameters."""
         if space.names == self.space.names:
             return self
-        return self._others.setdefault(space.names, self._others.get(space.names) or self._of(space))
+        if space.names not in self._others:
+            self._others[space.names] = self._of(space)
+        return self._others[space.names]
 
     def errors(self, candidates: Mapping[str, tuple[FloatArray, float]]) -> HeldoutErrors:
         """Return the errors of candidates (parameters, (K,), and latency [s], by name) and of "null"."""

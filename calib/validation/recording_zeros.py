@@ -13,11 +13,10 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem, samples_in
 from deal_hw.calib.fit.refinement import refine
-from deal_hw.description import RobotDescription
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.recordings.episode import SampledEpisode
-from deal_hw.sim.recordings.own_setups import OWN, own_setup, recording_of
+from deal_hw.sim.recordings.own_setups import OWN, own_setup, recordings_of
 from deal_hw.types import FloatArray
 
 MOST_ZERO = 0.3
@@ -28,11 +27,6 @@ MOST_NAMED = 6
 
 WINDOW_S = 0.2
 """Windows in which zeros of held-out recordings are fitted [s]."""
-
-
-def recordings_of(episodes: Sequence[SampledEpisode]) -> list[str]:
-    """Return the names of recordings, each once; parts between gaps are of one."""
-    return list(dict.fromkeys(recording_of(e.name) for e in episodes))
 
 
 def own_zeros(joints: Mapping[str, str], recordings: Sequence[str]) -> list[Parameter]:
@@ -65,15 +59,12 @@ def zeros_of(space: ParameterSpace, theta: FloatArray) -> dict[str, dict[str, fl
     return found
 
 
-def next_zeros(
-    description: RobotDescription, space: ParameterSpace, theta: FloatArray
-) -> tuple[list[Parameter], FloatArray, FloatArray]:
+def next_zeros(space: ParameterSpace, theta: FloatArray) -> tuple[list[Parameter], FloatArray, FloatArray]:
     """Return the zeros of a recording that comes, as the fitted ones predict them, with mean and std, (L,).
 
     There are none where the fitted recordings have no zeros of their own.
     """
-    found = zeros_of(space, theta)
-    units = dict(zip(description.joint_names, description.position_units, strict=True))
+    found, units = zeros_of(space, theta), _joints(space)
     more = [Parameter.encoder_bias(joint, MOST_ZERO, unit=units[joint]) for joint in found]
     values = [np.array(list(each.values())) for each in found.values()]
     # That of a further draw from a Gaussian whose mean comes from n draws, too.
@@ -81,17 +72,16 @@ def next_zeros(
     return more, np.array([np.mean(each) for each in values]), np.array(std)
 
 
-def with_other_zeros(
-    space: ParameterSpace, description: RobotDescription, episodes: Sequence[SampledEpisode]
-) -> ParameterSpace:
+def with_other_zeros(space: ParameterSpace, episodes: Sequence[SampledEpisode]) -> ParameterSpace:
     """Return parameters with zeros of further recordings after them, if those of fitted ones are there."""
-    joints = {p.elements[0] for p in space if p.setup.startswith(OWN)}
-    units = dict(zip(description.joint_names, description.position_units, strict=True))
     known = {p.setup for p in space}
-    names = [name for name in recordings_of(episodes) if own_setup(name) not in known]
-    return ParameterSpace(
-        [*space.parameters, *own_zeros({j: u for j, u in units.items() if j in joints}, names)]
-    )
+    names = [name for name in recordings_of(e.name for e in episodes) if own_setup(name) not in known]
+    return ParameterSpace([*space.parameters, *own_zeros(_joints(space), names)])
+
+
+def _joints(space: ParameterSpace) -> dict[str, str]:
+    """Return the joints that have zeros in single recordings, with their units."""
+    return {p.elements[0]: p.unit for p in space if p.setup.startswith(OWN)}
 
 
 def fitted_zeros(problem: Problem, theta: FloatArray, latency_s: float) -> FloatArray:

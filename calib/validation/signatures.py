@@ -19,7 +19,7 @@ from deal_hw.calib.fit.refinement import Refined
 from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.inverse_dynamics import link_torques
 from deal_hw.sim.parameters import KIND_TABLE
-from deal_hw.sim.recordings.own_setups import recording_of
+from deal_hw.sim.recordings.own_setups import recording_of, recordings_of
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
@@ -141,9 +141,9 @@ def by_recording(found: Sequence[Signature], names: Sequence[str]) -> list[Signa
 
     Args:
         found: Signatures; those of a zero are the same in all recordings, and say little beside a load.
-        names: Name of the recording of each of their episodes.
+        names: Name of each of their episodes, with its part if gaps divide the recording.
     """
-    recordings = list(dict.fromkeys(names))
+    recordings, own = recordings_of(names), [recording_of(name) for name in names]
     others = [s for s in found if s.cause != "zero"]
     if len(recordings) < 2:
         return others
@@ -151,12 +151,12 @@ def by_recording(found: Sequence[Signature], names: Sequence[str]) -> list[Signa
         Signature(
             "zero",
             s.where,
-            tuple(c if name == own else np.zeros_like(c) for name, c in zip(names, s.columns, strict=True)),
+            tuple(c if of == name else np.zeros_like(c) for of, c in zip(own, s.columns, strict=True)),
             s.unit,
         )
         for s in found
         if s.cause == "zero"
-        for own in recordings
+        for name in recordings
     ]
 
 
@@ -307,7 +307,7 @@ def masses(problem: Problem) -> list[Parameter]:
 def zeros(problem: Problem) -> list[Parameter]:
     """Return the encoders' zeros of a fixed-base robot in several recordings that no parameter sets."""
     # In a single recording a zero is one of all, which looks like a load.
-    if problem.robot.base is not None or len({recording_of(e.name) for e in problem.episodes}) < 2:
+    if problem.robot.base is not None or len(recordings_of(e.name for e in problem.episodes)) < 2:
         return []
     taken = {e for p in problem.space.parameters if p.kind == "encoder_bias" for e in p.elements}
     facts = problem.robot.description

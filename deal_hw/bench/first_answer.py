@@ -323,9 +323,7 @@ def _compared(
     held_out = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads)
     fits = {"sysid": (sysid.estimate, sysid.latency_s), "nominal": (work.space.nominal, 0.0)}
     errors = held_out.errors(fits).mean()
-    ours = []
-    for fit in shown:
-        ours.append(held_out.of(fit.space).errors({"fit": (fit.theta, fit.latency_s)}).mean()["fit"])
+    ours = [held_out.of(fit.space).errors({"fit": (fit.theta, fit.latency_s)}).mean()["fit"] for fit in shown]
     first = next(fit for fit, error in zip(shown, ours, strict=True) if error <= NEAR * ours[-1])
     return {
         "method": method,

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import cast
-
 import mujoco
 import numpy as np
 import pytest
@@ -20,7 +17,6 @@ from deal_hw.calib.validation.recording_zeros import (
     zeros_of,
 )
 from deal_hw.calib.validation.signatures import Signature, by_recording
-from deal_hw.description import RobotDescription
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings
@@ -98,11 +94,10 @@ def test_the_next_zero_is_predicted_from_those_found() -> None:
     space = ParameterSpace([Parameter.around("d", "dof_damping", ["elbow"], "N·m·s/rad", 0.1), *own])
     theta = np.array([0.1, 0.01, 0.03])
     assert zeros_of(space, theta) == {"elbow": {"a": 0.01, "b": 0.03}}
-    description = SimpleNamespace(joint_names=("elbow",), position_units=("rad",))
-    more, mean, std = next_zeros(cast(RobotDescription, description), space, theta)
+    more, mean, std = next_zeros(space, theta)
     assert [p.name for p in more] == ["elbow.encoder_bias"] and not more[0].setup
     assert mean == pytest.approx([0.02]) and std == pytest.approx([0.017320508])
-    assert next_zeros(cast(RobotDescription, description), ParameterSpace(space.free[:1]), theta[:1])[0] == []
+    assert next_zeros(ParameterSpace(space.free[:1]), theta[:1])[0] == []
 
 
 def test_an_alarm_has_the_zeros_of_six_recordings() -> None:

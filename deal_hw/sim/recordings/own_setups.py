@@ -6,7 +6,7 @@ Such as the zero of an incremental encoder, which is wherever the robot was when
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
@@ -19,6 +19,11 @@ OWN = "@"
 def recording_of(name: str) -> str:
     """Return the recording to which a part between gaps belongs."""
     return name.partition(", part ")[0]
+
+
+def recordings_of(names: Iterable[str]) -> list[str]:
+    """Return the recordings to which parts belong, each once."""
+    return list(dict.fromkeys(map(recording_of, names)))
 
 
 def own_setup(recording: str) -> str:

@@ -380,7 +380,7 @@ def calibrate_episodes(
     def judge(theta: FloatArray, latency: float, of: ParameterSpace) -> Mapping[str, float]:
         return {} if held_out is None else errors(held_out.of(of), theta, latency).nrmse
 
-    best = BestSoFar(space, None if held_out is None else judge, say, progress)
+    best = BestSoFar(space, judge, say, progress)
     searcher = make_method(method, refine=budget.refine, thorough=thorough, laws=laws)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
