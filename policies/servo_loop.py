@@ -16,6 +16,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, reported
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray
 
@@ -34,6 +35,7 @@ class ServoLoop:
         count: Members N.
         sensor: Sensor model of the reported state; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
         step_s: Physics step [s]; the device period by default.
         scene: Returns the model to simulate, made from the robot's own, such as one with a terrain.
 
@@ -51,6 +53,7 @@ class ServoLoop:
         *,
         sensor: SensorModel | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
         step_s: float | None = None,
         scene: Callable[[RobotModel], RobotModel] | None = None,
     ) -> None:
@@ -58,7 +61,8 @@ class ServoLoop:
         self.count = count
         period_s = 1.0 / description.device_rate_hz
         robot = load_model(description, step_s or period_s)
-        self.batch = ServoBatch(robot if scene is None else scene(robot), space, count, threads)
+        model = robot if scene is None else scene(robot)
+        self.batch = ServoBatch(model, space, count, threads, engine=engine)
         self._theta = np.repeat(space.nominal[None], count, axis=0)
         self._sensor = description.sensor if sensor is None else sensor
         self._window = _window_periods(self._sensor, description)
@@ -66,6 +70,7 @@ class ServoLoop:
         self._home = self.batch.position[0].copy()
         self._home[self.batch.robot.joints] = description.default_position
         self._loop = ClosedLoop(self.batch, description.steps_per_control, period_s, whole=True)
+        self._now: tuple[FloatArray, FloatArray] | None = None
         self._reports = np.zeros((self._window + 1, count, C))
         self.reported_position = np.zeros((count, C))
         self.reported_velocity = np.zeros((count, C))
@@ -73,12 +78,22 @@ class ServoLoop:
     @property
     def position(self) -> FloatArray:
         """True positions, (N, C)."""
-        return self.batch.position
+        return self._state()[0]
 
     @property
     def velocity(self) -> FloatArray:
         """True velocities, (N, C)."""
-        return self.batch.velocity
+        return self._state()[1]
+
+    def set_state(self, position: FloatArray, velocity: FloatArray, members: npt.NDArray[np.intp]) -> None:
+        """Set the true state, (M, C) each, of M members; what was reported remains."""
+        self.batch.set_state(position, velocity, members)
+        self._now = None
+
+    def _state(self) -> tuple[FloatArray, FloatArray]:
+        if self._now is None:
+            self._now = self.batch.position, self.batch.velocity
+        return self._now
 
     def restart(
         self,
@@ -104,7 +119,7 @@ class ServoLoop:
         members = np.flatnonzero(where)
         self._theta[members] = theta
         self.batch.set_parameters(self._theta, members)
-        self.batch.set_state(position, velocity, members)
+        self.set_state(position, velocity, members)
         start = setpoint
         if start is None:
             start = position[:, self.batch.robot.joints][:, list(self.description.actuated_index)]
@@ -132,8 +147,10 @@ class ServoLoop:
             limit = self.batch.servo_factor("servo_speed_limit") * np.array(self.description.speed_limit)
             rate = limit * self._loop.step_s
         position, velocity = (values[:, -1] for values in self._loop.advance(target, rate))
+        self._now = position, velocity
         diverged: BoolArray = ~np.isfinite(np.concatenate([position, velocity], axis=1)).all(axis=1)
         if diverged.any():
+            self._now = None
             position = np.where(diverged[:, None], self._home, position)
             velocity = np.where(diverged[:, None], 0.0, velocity)
         self._reports = np.roll(self._reports, 1, axis=0)

@@ -157,11 +157,11 @@ def test_without_a_driver_only_auto_goes_on(
     monkeypatch.setattr(warp_support, "find_spec", lambda name: True)
     said: list[str] = []
     if wanted == "auto":
-        assert choose_engine(wanted, robot, 100, "", said.append) == "mujoco"
+        assert choose_engine(wanted, robot, 100, "the search", said.append) == "mujoco"
         assert "no NVIDIA driver" in said[0]
     else:
         with pytest.raises(ConfigurationError, match=r"no NVIDIA driver .* --engine warp-cpu"):
-            choose_engine(wanted, robot, 100, "", said.append)
+            choose_engine(wanted, robot, 100, "the search", said.append)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_without_a_driver_only_auto_goes_on(
     [
         ("mujoco", 1000, "", "mujoco", ""),
         ("auto", 1000, "", "warp", "on the GPU, in float32"),
-        ("auto", 10, "", "mujoco", "a population of 10 is too small"),
+        ("auto", 10, "", "mujoco", "10 members are too few"),
         ("auto", 1000, "local", "mujoco", "the method local does not have"),
         ("warp", 10, "", "warp", "on the GPU, in float32"),
         ("warp-cpu", 10, "", "warp-cpu", "60 times slower"),
@@ -188,7 +188,7 @@ def test_the_engine_that_is_taken_is_said(
     monkeypatch.setattr(ctypes, "CDLL", Driver(0, 1))
     monkeypatch.setattr(warp_support, "find_spec", lambda name: True)
     said: list[str] = []
-    assert choose_engine(wanted, robot, population, method, said.append) == engine
+    assert choose_engine(wanted, robot, population, "the search", said.append, method) == engine
     assert words in "".join(said) and bool(said) == bool(words)
 
 
@@ -198,4 +198,4 @@ def test_a_missing_package_is_named_with_its_extra(
     """As every extra."""
     monkeypatch.setattr(warp_support, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"warp-lang is not installed; .*gpu"):
-        choose_engine("warp", robot, 100, "", lambda text: None)
+        choose_engine("warp", robot, 100, "the search", lambda text: None)

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -69,6 +69,23 @@ def test_charts_are_inverse_to_each_other(vector: FloatArray, around: FloatArray
     reference = to_quaternion(around, IDENTITY)
     back = to_vector(to_quaternion(vector, reference), reference)
     np.testing.assert_allclose(back, vector, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(hnp.arrays(float, (5, 4), elements=st.floats(-1, 1)), st.booleans())
+def test_single_precision_has_the_same_vectors(quaternion: FloatArray, around: bool) -> None:
+    """Those of a GPU: to seven digits, around the identity and around other references."""
+    quaternion[0] = IDENTITY
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    quaternion = np.where(length > 0.1, quaternion / np.maximum(length, 0.1), IDENTITY)
+    reference = np.array([0.6, 0.0, 0.8, 0.0]) if around else IDENTITY
+    found = to_vector(quaternion.astype(np.float32), reference)
+    exact = to_vector(quaternion, reference)
+    # Half a turn has two vectors.
+    turned = np.minimum(np.abs(found - exact), np.abs(found + exact))
+    half = np.abs(np.linalg.norm(exact, axis=1) - np.pi) < 1e-3
+    np.testing.assert_allclose(np.where(half[:, None], turned, found - exact), 0.0, atol=4e-6)
+    assert found.dtype == np.float32
 
 
 def test_a_quarter_turn_about_the_vertical_is_the_quaternion_everybody_knows() -> None:

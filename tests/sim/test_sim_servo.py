@@ -30,6 +30,17 @@ def test_delay_by_hand() -> None:
 
 
 @settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 12), st.integers(0, 10))
+def test_the_last_steps_of_a_delay_are_those_of_all(seed: int, longest: int, last: int) -> None:
+    """Bit for bit, whether the latencies reach before the first step or not, whole ones or not."""
+    rng = np.random.default_rng(seed)
+    path, before = rng.normal(size=(3, 10, 2)), rng.normal(size=(3, 2))
+    for latency in (rng.uniform(0, longest, 3), rng.integers(0, longest + 1, (3, 2)).astype(float)):
+        whole = delay(path, latency, before)
+        np.testing.assert_array_equal(delay(path, latency, before, last), whole[:, 10 - last :])
+
+
+@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 20))
 def test_delaying_the_target_delays_the_setpoint(seed: int, steps: int) -> None:
     """A whole-step latency on the target and on the set-point are the same thing."""

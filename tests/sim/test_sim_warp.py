@@ -1,6 +1,7 @@
-"""MuJoCo Warp on its CPU device beside mujoco.batch: one step, rollouts, laws, faults, and a search.
+"""MuJoCo Warp beside mujoco.batch: one step, rollouts, laws, faults, and environments.
 
-The first step of a model compiles kernels for up to a minute; they are kept in Warp's cache.
+On a GPU where there is one, else on its CPU device. The first step of a model compiles kernels for up to a
+minute; they are kept in Warp's cache.
 """
 
 from __future__ import annotations
@@ -18,21 +19,34 @@ from fakes.law_robots import robot as robot_of
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.robots.registry import parameter_spaces, robot_description
+from deal_hw.robots.registry import parameter_spaces, robot_description, training_task
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.engines import EngineName, make_engine
+from deal_hw.sim.engine.gpu import gpu_problem
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.parameters import KIND_TABLE, KINDS, apply_parameters
 from deal_hw.types import FloatArray
+from deal_hw.workflows.robot import described
+from deal_hw.workflows.train import udr_distribution
 
 # Not imported: tests are collected without it.
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo Warp is not installed (extra gpu)"),
-]
+pytestmark = pytest.mark.skipif(
+    find_spec("mujoco_warp") is None, reason="MuJoCo Warp is not installed (extra gpu)"
+)
+slow = pytest.mark.slow
 
-BOTH: tuple[EngineName, ...] = ("mujoco", "warp-cpu")
+WARP: EngineName = "warp-cpu" if gpu_problem() else "warp"
+BOTH: tuple[EngineName, ...] = ("mujoco", WARP)
 SHIPPED = ("cartpole", "so101", "ant", "allegro", "go2", "g1", "humanoid")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quickly_compiled() -> None:
+    """On a CPU kernels are compiled in half the time without optimisation, and these tests take few steps."""
+    import warp
+
+    if WARP == "warp-cpu":
+        warp.config.optimization_level = 0
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +79,7 @@ def test_rollouts_agree(robot: RobotModel) -> None:
     assert np.abs(found[0][0]).max() > 0.05
 
 
+@slow
 def test_parameters_and_states_go_on(robot: RobotModel) -> None:
     """Set again, and advanced twice: a rollout begins where the one before ended."""
     ends = []
@@ -80,11 +95,12 @@ def test_parameters_and_states_go_on(robot: RobotModel) -> None:
     np.testing.assert_allclose(ends[1][1], ends[0][1], atol=1e-4)
 
 
+@slow
 def test_one_world_that_diverges_is_alone(robot: RobotModel) -> None:
     """A start that is no number: that member is NaN in that window, and the others are as without it."""
     position, velocity = starts(3, 2)
     command = np.full((3, 2, 20, 1), 0.05)
-    batch = members(robot, "warp-cpu")
+    batch = members(robot, WARP)
     sound = batch.advance_windows((position, velocity), command, 10)
     velocity[1, 0, 1] = np.nan
     x, v = batch.advance_windows((position, velocity), command, 10)
@@ -93,8 +109,17 @@ def test_one_world_that_diverges_is_alone(robot: RobotModel) -> None:
     assert np.isnan(x[bad]).all() and np.isnan(v[bad]).all()
     np.testing.assert_array_equal(x[~bad], sound[0][~bad])
     np.testing.assert_array_equal(v[~bad], sound[1][~bad])
+    # Nothing of it is left in the next rollout.
+    again = batch.advance_windows(starts(3, 2), command, 10)
+    np.testing.assert_array_equal(again, sound)
+    batch.set_state(np.array([[0.0, 0.1], [np.nan, 0.1], [0.0, 0.2]]), np.zeros((3, 2)))
+    x, _ = batch.advance(command[:, 0])
+    assert np.isnan(x[:, -1, 0]).tolist() == [False, True, False]
+    # As in MuJoCo, a member that diverged begins anew where the model does.
+    assert np.isfinite(batch.position).all()
 
 
+@slow
 def test_too_many_worlds_are_refused_with_the_number_that_fits(
     robot: RobotModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,10 +127,11 @@ def test_too_many_worlds_are_refused_with_the_number_that_fits(
     from deal_hw.sim.engine import warp_engine
 
     monkeypatch.setattr(warp_engine._Worlds, "bytes", property(lambda worlds: 4e12))
-    with pytest.raises(ConfigurationError, match=r"population of 3 .* at most 0 worlds"):
-        members(robot, "warp-cpu")
+    with pytest.raises(ConfigurationError, match=r"3 members do not fit .* at most 0 worlds"):
+        members(robot, WARP)
 
 
+@slow
 def test_constraints_without_room_get_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two joints with friction are two rows, and there is room for one at first."""
     from deal_hw.sim.engine import warp_engine
@@ -134,6 +160,7 @@ def servo_armature(model: RobotModel) -> Parameter:
     )  # fmt: skip
 
 
+@slow
 @pytest.mark.parametrize(
     ("text", "parameters"),
     [
@@ -170,6 +197,7 @@ def test_laws_between_steps_agree(tmp_path: Path, text: str, parameters: list[An
     np.testing.assert_allclose(found[1][1], found[0][1], atol=2e-3)
 
 
+@slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_models_agree(name: str) -> None:
     """One step from random states to 1e-4 of the step's change; a rollout to its statistics."""
@@ -242,6 +270,7 @@ OWN_ELEMENTS = {"rod_length": "rod", "motor_gain": "cart", "motor_gear": "cart"}
 OWN_VALUES = {"geom_restitution": 0.4, "dof_friction_creep": 0.02}
 
 
+@slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_a_model_field_agrees(kind: str) -> None:
     """Three members whose one parameter differs: twenty steps of a robot, and of a ball on the floor."""
@@ -264,3 +293,24 @@ def test_every_kind_of_a_model_field_agrees(kind: str) -> None:
         assert not bad.any()
         ends.append(record["qvel"][:, 0, 0])
     np.testing.assert_allclose(ends[1], ends[0], atol=2e-4 * np.abs(ends[0]).max())
+
+
+@slow
+@pytest.mark.parametrize(("robot", "task"), [("cartpole", ""), ("go2", ""), ("go2", "climb")])
+def test_environments_agree(robot: str, task: str) -> None:
+    """Five ticks of four robots, of which two are restarted: observations and rewards, to rounding."""
+    distribution = udr_distribution(robot, task)
+    found = []
+    for engine in BOTH:
+        env = training_task(robot, task).make(described(robot), distribution, 4, engine=engine)
+        env.reset(seed=1)
+        rng, seen = np.random.default_rng(2), []
+        for tick in range(5):
+            if tick == 3:
+                env._restart(np.array([True, False, True, False]))
+            observation, reward, *_ = env.step(rng.uniform(-0.2, 0.2, env.action_space.shape))
+            seen.append(np.column_stack([observation, reward]))
+        found.append(np.array(seen))
+    assert np.isfinite(found[1]).all()
+    np.testing.assert_allclose(found[1], found[0], atol=5e-3)
+    assert np.abs(found[0][-1] - found[0][0]).max() > 0.05

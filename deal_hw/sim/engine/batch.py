@@ -106,6 +106,7 @@ class ServoBatch:
     Attributes:
         commands: What the drives make of commands; set-points given to :meth:`advance` have passed it.
         effort_joints: Columns of the joints whose effort the parameters describe, (E,).
+        engine_name: What simulates.
         effort: Efforts of these joints at the samples of the last :meth:`advance`, as the robot would report
             them, (N, S // every, E).
     """
@@ -129,6 +130,7 @@ class ServoBatch:
             # Windows begin with positions and velocities: the filters' states follow from the commands.
             model = copy.copy(model)
             drop_filters(model)
+        self.engine_name = engine
         self.engine = make_engine(engine, model, robot.model, count, threads or default_threads())
         self.batch = self.engine.batch
         self._fields = self.engine.fields
@@ -209,8 +211,11 @@ class ServoBatch:
         return self._true(position, slice(None))
 
     def _true(self, position: FloatArray, rows: npt.NDArray[np.intp] | slice) -> FloatArray:
-        true = position - self._bias[rows] if self._biased else position
-        return true if self._scale is None else true / self._scale[rows]
+        """Return the true joint positions of reported ones, (M, J) or (M, G, J), of members."""
+        bias, scale = self._bias[rows], self._scale
+        shape = (len(bias), *(1,) * (position.ndim - 2), bias.shape[1])
+        true = position - bias.reshape(shape) if self._biased else position
+        return true if scale is None else true / scale[rows].reshape(shape)
 
     def lag_s(self, latency_s: FloatArray) -> FloatArray:
         """Return the delay of commands: the latency, plus each actuator's command delay.
@@ -272,19 +277,18 @@ class ServoBatch:
             where: The members.
             reference: Reference orientation, (4,) or (N, 4); the identity by default.
         """
-        rows = np.arange(self.count)[where][:, None]
-        joints = position[..., self.robot.joints]
-        self._qpos[rows, list(self.robot.qpos)] = self._true(joints, rows[:, 0])
-        if self.robot.base is not None:
-            at = self.robot.base[0]
-            self._qpos[rows, [at, at + 1, at + 2]] = position[..., :3]
-            orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
-            self._qpos[rows, [at + 3, at + 4, at + 5, at + 6]] = orientation
-        self._qvel[rows, self._dof] = velocity
-        if self._scale is not None:
-            self._qvel[rows, list(self.robot.qvel)] /= self._scale[rows[:, 0]]
+        rows = np.arange(self.count)[where]
+        qpos, qvel = self._qpos[rows][:, None], self._qvel[rows][:, None]
+        # One window; a reference is (4,), or one of each member.
+        position, velocity = (
+            np.broadcast_to(x, (len(rows), x.shape[-1]))[:, None] for x in (position, velocity)
+        )
+        if reference is not None and reference.ndim == 2:
+            reference = reference[:, None]
+        self._put_state(qpos, qvel, position, velocity, rows, reference)
+        self._qpos[rows], self._qvel[rows] = qpos[:, 0], qvel[:, 0]
         # A warm start from another episode would make results depend on history in the last digits.
-        self._warmstart[rows[:, 0]] = 0.0
+        self._warmstart[rows] = 0.0
 
     @property
     def position(self) -> FloatArray:
@@ -366,13 +370,29 @@ class ServoBatch:
         """
         position, velocity = start
         count, windows = position.shape[:2]
-        qpos = np.empty((count, windows, self._qpos.shape[1]))
-        qvel = np.empty((count, windows, self._qvel.shape[1]))
-        for g in range(windows):
-            own = None if start_reference is None else start_reference[g]
-            self.set_state(position[:, g], velocity[:, g], reference=own)
-            qpos[:, g], qvel[:, g] = self._qpos, self._qvel
+        qpos, qvel = (np.repeat(now[:, None], windows, axis=1) for now in (self._qpos, self._qvel))
+        self._put_state(qpos, qvel, position, velocity, np.arange(count), start_reference)
         return self._roll(setpoint, every, reference, force, (qpos, qvel))
+
+    def _put_state(
+        self,
+        qpos: FloatArray,
+        qvel: FloatArray,
+        position: FloatArray,
+        velocity: FloatArray,
+        rows: npt.NDArray[np.intp],
+        reference: FloatArray | None,
+    ) -> None:
+        """Put tangent coordinates, (M, G, C), of the members in ``rows`` into (M, G, nq) and (M, G, nv)."""
+        qpos[..., list(self.robot.qpos)] = self._true(position[..., self.robot.joints], rows)
+        if self.robot.base is not None:
+            at = self.robot.base[0]
+            qpos[..., at : at + 3] = position[..., :3]
+            orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
+            qpos[..., at + 3 : at + 7] = orientation
+        qvel[..., self._dof] = velocity
+        if self._scale is not None:
+            qvel[..., list(self.robot.qvel)] /= self._scale[rows][:, None]
 
     def _roll(
         self,
@@ -394,13 +414,13 @@ class ServoBatch:
             if force is not None:
                 # Otherwise the engine would keep the last forces.
                 self._applied[:] = 0.0
-        position = self._tangent_coordinates(record["qpos"], reference)
-        velocity = self._reported_speed(record["qvel"][..., self._dof])
+        position = np.asarray(self._tangent_coordinates(record["qpos"], reference), dtype=float)
+        velocity = np.asarray(self._reported_speed(record["qvel"][..., self._dof]), dtype=float)
         if bad.any():
             position, velocity = position.copy(), velocity.copy()
             position[bad], velocity[bad] = np.nan, np.nan
         if self._efforts is not None:
-            torque, step_s = record[TORQUE], self.robot.step_s
+            torque, step_s = np.asarray(record[TORQUE], dtype=float), self.robot.step_s
             report = [self._efforts.report(torque[:, g], every, step_s) for g in range(windows)]
             self.effort = np.stack(report, axis=1)
             self.effort[bad] = np.nan
@@ -422,12 +442,14 @@ class ServoBatch:
                 setpoint = setpoint / self._scale[:, None, None, actuated]
             if self._scaled:
                 setpoint = setpoint / self._per_ctrl
-        nu = self.robot.model.nu
-        if nu != setpoint.shape[-1] or list(self.robot.actuator) != list(range(nu)):
-            control = np.zeros((*setpoint.shape[:-1], nu))
-            control[..., list(self.robot.actuator)] = setpoint
-        else:
+        nu, actuator = self.robot.model.nu, list(self.robot.actuator)
+        if actuator == list(range(nu)):
             control = setpoint
+        elif sorted(actuator) == list(range(nu)):
+            control = np.take(setpoint, np.argsort(actuator), axis=-1)
+        else:
+            control = np.zeros((*setpoint.shape[:-1], nu))
+            control[..., actuator] = setpoint
         spec = mujoco.mjtState.mjSTATE_CTRL
         if force is not None:
             applied = np.zeros((*setpoint.shape[:-1], self.robot.model.nv))

@@ -82,7 +82,7 @@ class ClosedLoop:
             ahead = slew(self._path[:, -1], ahead, rate)
         path = np.concatenate([self._path, ahead], axis=1)
         self._path = path[:, self.steps :]
-        late = delay(path, self._lag, path[:, 0])[:, -self.steps :]
+        late = delay(path, self._lag, path[:, 0], self.steps)
         if self.batch.commands.any:
             late, self._memory = self.batch.commands.act(late, self._memory, self.step_s)
         control = on_physics_steps(self.batch, late, self.step_s)

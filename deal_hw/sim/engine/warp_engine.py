@@ -37,11 +37,18 @@ DERIVED = (
 )
 """Fields that mj_setConst derives, and a step of MuJoCo Warp reads."""
 
+STATES = ("qpos", "qvel", "qacc_warmstart", "act")
+"""Fields of MjData that a rollout goes on from."""
+
+INPUTS = frozenset({*STATES, "ctrl", "qfrc_applied", "xfrc_applied"})
+"""Fields of MjData that are set before a step."""
+
 UNREAD = frozenset({"body_sameframe", "bvh_aabb"})
 """Fields that speed up MuJoCo's kinematics and collisions, and MuJoCo Warp has not."""
 
 MOST_WORLDS = 16384
-"""Most worlds at once. MuJoCo Warp's public figures rise to 8,192 worlds of a walking robot; not measured."""
+"""Most worlds at once. On an H200 bare steps a second of the DEAL paper's robots rise to so many; more were
+not measured."""
 
 MEMORY_SHARE = 0.7
 """Share of the device's free memory that worlds take at most."""
@@ -77,26 +84,38 @@ class WarpEngine:
             check_gpu()
         self._device = _device(device)
         self._members = MujocoEngine(model, nominal, count, threads)
-        self.batch, self.bind = self._members.batch, self._members.bind
-        # Sensors are not read; their kernels would take a third of the time to compile.
+        self.batch = self._members.batch
+        self._outputs: dict[str, FloatArray] = {}
+        # Sensors are not read; their kernels would take a third of the time to compile. MuJoCo Warp has no
+        # mid-phase to be disabled.
         self._model = copy.copy(model)
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
         self._count = count
         self._worlds: _Worlds | None = None
         self._growth = 1
-        self.fields: Fields = _SeenFields(self._members.fields)
+        self.fields = _SeenFields(self._members.fields)
         self._fitting = self._measure()
         self.windows = max(min(MOST_WORLDS, self._fitting) // count, 1)
         if count > self._fitting:
             raise ConfigurationError(
-                f"a population of {count} does not fit into the free memory of {self._device}: at most "
-                f"{self._fitting} worlds of this model do; give --population {self._fitting} or less, or use "
-                "--engine mujoco"
+                f"{count} members do not fit into the free memory of {self._device}: of this model at most "
+                f"{self._fitting} worlds do; give --population or --members {self._fitting}, or use --engine "
+                "mujoco"
             )
+
+    def bind(self, name: str) -> FloatArray:
+        """Return the live values of an MjData field; what is no state is copied after rollouts that go on."""
+        if name in INPUTS:
+            return self._members.bind(name)
+        if name not in self._outputs:
+            self._outputs[name] = self._members.bind(name).copy()
+        return self._outputs[name]
 
     def set_const(self, ids: npt.NDArray[np.intp] | None = None) -> None:
         """Derive constants by MuJoCo, on this machine."""
         self._members.set_const(ids)
+        self.fields.changed.update(DERIVED)
 
     def rollout(
         self,
@@ -117,6 +136,7 @@ class WarpEngine:
         for _ in range(MOST_GROWTH):
             worlds = self._room(count * windows)
             worlds.put_fields(self.fields, laws)
+            self.fields.changed.clear()
             worlds.begin(start, self.bind("qacc_warmstart") if goes_on else None, self.bind("act"))
             records = worlds.run(control, spec, recorded, laws)
             if not worlds.overflow():
@@ -128,21 +148,30 @@ class WarpEngine:
                 "the model cannot be simulated: its contacts and constraints do not fit into MuJoCo Warp's "
                 "memory; use --engine mujoco"
             )
-        if goes_on:
-            for name in ("qpos", "qvel", "qacc_warmstart", "act"):
-                self.bind(name)[:] = worlds.state(name)
+        bad = np.zeros(windows * count, dtype=bool)
+        for name in {"qpos", "qvel"} & records.keys():
+            # The largest is NaN where any is.
+            bad |= ~(np.abs(records[name]).max(axis=(0, 2), initial=0.0) <= DIVERGED)
+        bad = bad.reshape(windows, count).T
         shaped = {
             name: np.moveaxis(values.reshape(len(values), windows, count, -1), 2, 0).swapaxes(1, 2)
             for name, values in records.items()
         }
-        bad = np.zeros((count, windows), dtype=bool)
-        for name in {"qpos", "qvel"} & shaped.keys():
-            with np.errstate(invalid="ignore"):
-                sound = np.abs(shaped[name]) <= DIVERGED
-            bad |= ~sound.all(axis=(2, 3))
         if bad.any():
             logging.getLogger(__name__).debug("%d of %d worlds diverged", np.count_nonzero(bad), bad.size)
+        if goes_on:
+            self._keep(worlds, bad[:, 0])
         return shaped, bad
+
+    def _keep(self, worlds: _Worlds, bad: Mask) -> None:
+        """Copy the members' states and outputs back; diverged members begin anew, as in MuJoCo."""
+        for name in STATES:
+            self.bind(name)[:] = worlds.state(name)
+        for name, values in self._outputs.items():
+            values[:] = worlds.state(name).reshape(values.shape)
+        self.bind("qpos")[bad] = self._model.qpos0
+        for name in STATES[1:]:
+            self.bind(name)[bad] = 0.0
 
     def bare(self, count: int, steps: int) -> tuple[Callable[[], None], str]:
         """Return what does bare steps in so many worlds, to measure beside rollouts, and the device."""
@@ -174,16 +203,24 @@ class WarpEngine:
 
 
 class _SeenFields:
-    """The members' fields, and the names of those that were asked for: these differ between members."""
+    """The members' fields, and the names of those that were asked for: these differ between members.
+
+    Attributes:
+        seen: These names.
+        changed: Names of those that may have changed since the last copy to a device.
+    """
 
     def __init__(self, fields: Fields) -> None:
         self._fields = fields
         self.model = fields.model
         self.seen: set[str] = set()
+        self.changed: set[str] = set()
 
     def get(self, name: str) -> Array:
+        """Return a field, which the caller may write."""
         if name not in UNREAD:
             self.seen.add(name)
+            self.changed.add(name)
         return self._fields.get(name)
 
     def read(self, name: str) -> Array:
@@ -223,7 +260,7 @@ class _Worlds:
         except (RuntimeError, MemoryError) as err:
             raise CalibrationError(
                 f"{count} worlds do not fit into the memory of {device} ({short(str(err))}); give a smaller "
-                "--population, or use --engine mujoco"
+                "--population or --members, or use --engine mujoco"
             ) from err
         self._nu, self._nv = model.nu, model.nv
         self._step = wp.zeros(1, dtype=int, device=device)
@@ -234,6 +271,7 @@ class _Worlds:
         self._loaded = 0
         self._graph: Any = None
         self._bare: Any = None
+        self._fresh = True
 
     @property
     def bytes(self) -> int:
@@ -241,9 +279,12 @@ class _Worlds:
         return _bytes(self._data)
 
     def put_fields(self, fields: Any, laws: StepLaws | None) -> None:
-        """Copy the members' fields; those that laws write get one row a world."""
+        """Copy the members' fields that may have changed; those that laws write get one row a world."""
         written = {"dof_frictionloss", "actuator_forcerange"} if laws is not None else set()
-        for name in sorted(fields.seen | set(DERIVED)):
+        names = fields.changed | (written & fields.seen)
+        if self._fresh:
+            self._fresh, names = False, fields.seen | set(DERIVED)
+        for name in sorted(names):
             target = getattr(self._model, name, None)
             if target is None:
                 raise ConfigurationError(
@@ -282,7 +323,7 @@ class _Worlds:
                 target.assign(part)
 
     def begin(self, start: State, warmstart: FloatArray | None, act: FloatArray) -> None:
-        """Set the worlds' states, and clear everything else that a step reads from the one before.
+        """Set the worlds' states, and clear what else a step reads from the one before.
 
         Args:
             start: Start states, (N, G, ...) each.
@@ -290,12 +331,15 @@ class _Worlds:
             act: Activations, (N, na).
         """
         data = self._data
-        with self._wp.ScopedDevice(self._device):
-            self._mjw.reset_data(self._model, data)
         for target, values in zip((data.qpos, data.qvel), start, strict=True):
-            flat = np.swapaxes(values, 0, 1).reshape(self.count, -1)
-            target.assign(np.ascontiguousarray(flat, dtype=np.float32))
-        if warmstart is not None:
+            flat = np.swapaxes(values, 0, 1).astype(np.float32)
+            target.assign(np.ascontiguousarray(flat.reshape(self.count, -1)))
+        # The package's reset compiles its kernels' sources anew in each call, for 15 ms.
+        data.qfrc_applied.zero_()
+        data.overflow.zero_()
+        if warmstart is None:
+            data.qacc_warmstart.zero_()
+        else:
             data.qacc_warmstart.assign(np.ascontiguousarray(warmstart, dtype=np.float32))
         if act.shape[1]:
             flat = np.tile(act, (self.count // self._members, 1))
@@ -306,9 +350,7 @@ class _Worlds:
     ) -> dict[str, FloatArray]:
         """Simulate; return the records, (S // every, worlds, F) each."""
         steps = control.shape[2]
-        # (N, G, S, U) to (S, worlds, U).
-        flat = control.transpose(2, 1, 0, 3).reshape(steps, self.count, -1)
-        self._put_control(np.ascontiguousarray(flat, dtype=np.float32))
+        self._put_control(np.ascontiguousarray(control))
         self._put_records(recorded, steps)
         self._step.zero_()
         wp = self._wp
@@ -322,10 +364,7 @@ class _Worlds:
             else:
                 for _ in range(steps):
                     self._launch()
-        return {
-            name: np.asarray(out.numpy()[: steps // every], dtype=float)
-            for name, (every, out) in self._records.items()
-        }
+        return {name: out[: steps // every].numpy() for name, (every, out) in self._records.items()}
 
     def _run_graph(self, steps: int) -> None:
         if self._graph is None:
@@ -338,12 +377,13 @@ class _Worlds:
         for _ in range(steps):
             self._wp.capture_launch(self._graph)
 
-    def _put_control(self, control: npt.NDArray[np.float32]) -> None:
-        held = self._control
-        if held is None or held.shape[0] < len(control) or held.shape[2] != control.shape[2]:
-            self._control, self._graph = self._wp.array(control, dtype=float, device=self._device), None
-            return
-        self._wp.copy(held[: len(control)], self._wp.array(control, dtype=float, device=self._device))
+    def _put_control(self, control: FloatArray) -> None:
+        # In double precision: to copy twice the bytes takes less than to convert them here.
+        if self._control is None or self._control.shape != control.shape:
+            self._control = self._wp.array(control, dtype=self._wp.float64, device=self._device)
+            self._graph = None
+        else:
+            self._control.assign(control)
 
     def _put_records(self, recorded: Mapping[str, int], steps: int) -> None:
         for name in [*self._records]:
@@ -362,7 +402,7 @@ class _Worlds:
         from deal_hw.sim.engine import warp_kernels as kernels
 
         inputs = [self._step, self._control, self._nu, self._data.ctrl, self._data.qfrc_applied]
-        self._wp.launch(kernels.set_control, dim=self._control.shape[1:], inputs=inputs)
+        self._wp.launch(kernels.set_control, dim=(self.count, self._control.shape[3]), inputs=inputs)
 
     def _launch(self) -> None:
         """Launch the kernels of one step, with what is around it."""

@@ -9,14 +9,15 @@ import warp as wp
 @wp.kernel
 def set_control(
     step: wp.array[int],
-    control: wp.array3d[float],
+    control: wp.array4d[wp.float64],
     nu: int,
     ctrl: wp.array2d[float],
     applied: wp.array2d[float],
 ) -> None:
-    """Set controls and applied forces of this step from (S, worlds, nu or nu + nv)."""
+    """Set controls and applied forces of this step from (N, G, S, nu or nu + nv)."""
     w, i = wp.tid()
-    value = control[step[0], w, i]
+    members = control.shape[0]
+    value = float(control[w % members, w // members, step[0], i])
     if i < nu:
         ctrl[w, i] = value
     else:

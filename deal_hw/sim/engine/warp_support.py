@@ -17,8 +17,9 @@ from deal_hw.sim.engine.model import RobotModel
 Say: TypeAlias = Callable[[str], None]
 
 LEAST_MEMBERS = 64
-"""Fewest members of a population for which ``auto`` takes a GPU. Not measured: a step of a few worlds is as
-long as the launch of its kernels, in which a CPU does some hundred steps of a small robot."""
+"""Fewest members for which ``auto`` takes a GPU: of a search, each of which is simulated in tens of windows
+at once, or of a training, which takes one CPU core without a GPU. On an H200 a step of 256 Go2 takes 1.5 ms,
+as do 540 steps on its machine's 16 cores (docs/how-to/gpu.md)."""
 
 _INSTEAD = "use --engine mujoco"
 
@@ -101,16 +102,17 @@ def check_gpu() -> None:
 
 
 def choose_engine(
-    wanted: WantedEngine, robot: RobotModel, population: int, without: str, say: Say
+    wanted: WantedEngine, robot: RobotModel, members: int, what: str, say: Say, without: str = ""
 ) -> EngineName:
-    """Return what simulates a search's population, and say it.
+    """Return what simulates many members, and say it.
 
     Args:
         wanted: What was asked for.
         robot: The robot; all its set-ups are checked.
-        population: Members of the population.
-        without: Name of the method where it has no search that another engine can simulate; else "".
+        members: Members: of a search's population, or of a training.
+        what: What is simulated, in words: "the search".
         say: Called with a sentence.
+        without: Name of the method where it has no search that another engine can simulate; else "".
 
     Raises:
         ConfigurationError: The engine that was asked for cannot simulate this model, search or population.
@@ -129,20 +131,18 @@ def choose_engine(
         check_installed()
         if wanted != "warp-cpu":
             check_gpu()
-        if wanted == "auto" and population < LEAST_MEMBERS:
-            raise ConfigurationError(
-                f"a population of {population} is too small for a GPU (fewer than {LEAST_MEMBERS})"
-            )
+        if wanted == "auto" and members < LEAST_MEMBERS:
+            raise ConfigurationError(f"{members} members are too few for a GPU (fewer than {LEAST_MEMBERS})")
     except (ConfigurationError, MissingExtraError) as err:
         if wanted != "auto":
             raise
-        say(f"mujoco simulates the search: {err}")
+        say(f"mujoco simulates {what}: {err}")
         return "mujoco"
     if wanted == "warp-cpu":
         say(
-            "MuJoCo Warp simulates the search on a CPU, about 60 times slower than mujoco; its kernels are "
+            f"MuJoCo Warp simulates {what} on a CPU, about 60 times slower than mujoco; its kernels are "
             "compiled first, for a minute"
         )
         return "warp-cpu"
-    say("MuJoCo Warp simulates the search on the GPU, in float32; all fits are by mujoco, in float64")
+    say(f"MuJoCo Warp simulates {what} on the GPU, in float32")
     return "warp"

@@ -76,7 +76,9 @@ def changes(steps: int, *series: FloatArray) -> list[int]:
     return [0, *(np.flatnonzero(changed) + 1).tolist(), steps]
 
 
-def delay(setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray) -> FloatArray:
+def delay(
+    setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray, last: int | None = None
+) -> FloatArray:
     """Delay set-points by a latency, linear between steps.
 
     Args:
@@ -84,18 +86,23 @@ def delay(setpoint: FloatArray, latency_steps: FloatArray, before: FloatArray) -
         latency_steps: Latency of each member in steps, (N,), or of each of its actuators, (N, A); may be
             fractional.
         before: Set-point before the first step, (N, A).
+        last: Return only so many steps at the end; None for all S.
 
     Returns:
-        The delayed set-point, (N, S, A).
+        The delayed set-point, (N, S, A) or (N, last, A).
     """
     if latency_steps.ndim == 1:
         latency_steps = latency_steps[:, None]
     whole = np.floor(latency_steps).astype(int)
     part = (latency_steps - whole)[:, None]
-    longest = int(whole.max(initial=0)) + 1
-    padded = np.concatenate([np.repeat(before[:, None], longest, axis=1), setpoint], axis=1)
     steps = setpoint.shape[1]
-    index = longest - whole[:, None] + np.arange(steps)[:, None]
+    wanted = np.arange(0 if last is None else steps - last, steps)
+    # A step before the first is read only where the latency is longer than what comes before a wanted one.
+    longest = max(int(whole.max(initial=0)) + 1 - int(wanted[0] if len(wanted) else 0), 0)
+    padded = setpoint
+    if longest:
+        padded = np.concatenate([np.repeat(before[:, None], longest, axis=1), setpoint], axis=1)
+    index = longest - whole[:, None] + wanted[:, None]
     late = np.take_along_axis(padded, index, axis=1)
     if not part.any():
         return late

@@ -200,7 +200,7 @@ class BatchPlatforms:
     def __init__(self, batch: ServoBatch, terrain: Terrain) -> None:
         model = batch.robot.model
         self._geoms = terrain_geoms(model)
-        self._position = batch.batch.expand("geom_pos")
+        self._fields = batch.engine.fields
         self._nominal = np.array(model.geom_pos[self._geoms])
         self._terrain = terrain
         self.rise = np.full(batch.count, terrain.rise)
@@ -217,9 +217,10 @@ class BatchPlatforms:
         self.rise[members], self.distance[members] = rise, distance
         # A platform of height 0 lies below the floor: two surfaces at one height would share each contact.
         up = np.where(rise > 0.0, rise, -EDGE_M) - self._terrain.rise
+        position = self._fields.get("geom_pos")
         for number, geom in enumerate(self._geoms):
-            self._position[members, geom, 0] = self._nominal[number, 0] + distance - self._terrain.distance_m
-            self._position[members, geom, 2] = self._nominal[number, 2] + up
+            position[members, geom, 0] = self._nominal[number, 0] + distance - self._terrain.distance_m
+            position[members, geom, 2] = self._nominal[number, 2] + up
 
     def height(self, x: FloatArray) -> FloatArray:
         """Return the height of each member's ground at places along x, (N, ...) [m]."""

@@ -363,7 +363,8 @@ def calibrate_episodes(
         from deal_hw.sim.engine.warp_support import choose_engine
 
         searches = search_of(method) in ENGINE_SEARCHES or method in SEARCHING
-        problem.engine = choose_engine(engine, robot, budget.population, method if not searches else "", say)
+        without = "" if searches else method
+        problem.engine = choose_engine(engine, robot, budget.population, "the search", say, without)
     check_delays(problem)
     check_efforts(problem)
     in_loop = policy is not None and search_of(method) in CLOSED_LOOP_METHODS
