@@ -118,6 +118,7 @@ class CanterEnv(Go2Env):
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
 
     Raises:
         ConfigurationError: The description does not name four feet.

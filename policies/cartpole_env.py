@@ -13,6 +13,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import ServoVectorEnv, check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.types import FloatArray
 
 VELOCITIES, ACTIONS = 8, 14
@@ -103,6 +104,7 @@ class CartPoleEnv(ServoVectorEnv):
         task: The settings.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class CartPoleEnv(ServoVectorEnv):
         task: BalanceTask | None = None,
         sensor: SensorModel | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.task = task or BalanceTask()
         self.failure_reward = -self.task.fall_cost
@@ -126,6 +129,7 @@ class CartPoleEnv(ServoVectorEnv):
             host_delay_s=self.task.host_delay_s,
             sensor=sensor,
             threads=threads,
+            engine=engine,
         )
 
     def start_state(self, rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:

@@ -17,6 +17,7 @@ from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import CLIMBED, OBSTACLE_AXES, ObservationTerm, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.legged.terrain import EDGE_M, BatchPlatforms, Terrain, terrain_geoms, with_terrain
 from deal_hw.types import FloatArray
@@ -96,6 +97,7 @@ class ClimbEnv(Go2Env):
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
 
     Attributes:
         level: Level of each member, (N,); 0 is the lowest.
@@ -114,6 +116,7 @@ class ClimbEnv(Go2Env):
         *,
         task: ClimbTask | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         task = task or ClimbTask()
         self._nominal = Terrain(kind="box", rise=task.rise_m[0], distance_m=max(task.distance_m[0], 0.5))
@@ -124,7 +127,7 @@ class ClimbEnv(Go2Env):
         self._tries = [deque[bool](maxlen=KEPT_TRIES) for _ in range(task.levels)]
         self._way = np.zeros(count)
         self._outcome = np.full(count, np.nan)
-        super().__init__(description, distribution, count, task=task, threads=threads)
+        super().__init__(description, distribution, count, task=task, threads=threads, engine=engine)
         self._platforms = BatchPlatforms(self.loop.batch, self._nominal)
 
     @staticmethod

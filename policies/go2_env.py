@@ -26,6 +26,7 @@ from deal_hw.policies.locomotion import (
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import CLOCK_AXES, Observation, ObservationTerm, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray, JointCommand
@@ -188,6 +189,7 @@ class Go2Env(LocomotionEnv):
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
 
     Raises:
         ConfigurationError: The description does not name four feet.
@@ -204,6 +206,7 @@ class Go2Env(LocomotionEnv):
         *,
         task: WalkTask | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.task = task = task or self.task_type()
         self.failure_reward = -task.fall_cost
@@ -239,12 +242,13 @@ class Go2Env(LocomotionEnv):
             start_noise=task.start_noise_rad,
             host_delay_s=task.host_delay_s,
             threads=threads,
+            engine=engine,
             step_s=task.physics_step_s,
         )
         model = self.loop.batch.robot.model
         self._feet = [element_id(model, "geom", name) for name in description.feet]
         self._radius = model.geom_size[self._feet, 0]
-        self._places = self.loop.batch.batch.bind("geom_xpos")
+        self._places = self.loop.batch.engine.bind("geom_xpos")
         self._feet_before = np.full((count, len(TROT), 3), np.nan)
         self._hips = [i for i, name in enumerate(description.joint_names) if "hip" in name]
 
@@ -383,7 +387,7 @@ class Go2Env(LocomotionEnv):
         if pushed.size:
             position, velocity = self.loop.position[pushed], self.loop.velocity[pushed]
             velocity[:, :2] += rng.uniform(-1.0, 1.0, (pushed.size, 2)) * task.push_m_s
-            self.loop.batch.set_state(position, velocity, pushed)
+            self.loop.set_state(position, velocity, pushed)
         self._draw_commands(rng.random(self.num_envs) < 1.0 / task.command_ticks, rng)
         result = super().step(actions)
         self._note(falls=float(result[2].sum()))

@@ -17,6 +17,7 @@ from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.rotations import rotation_between
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.types import FloatArray
 
 _UP = 2
@@ -95,6 +96,7 @@ class HandEnv(LocomotionEnv):
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class HandEnv(LocomotionEnv):
         *,
         task: TurnTask | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.task = task = task or TurnTask()
         self.failure_reward = -task.drop_cost
@@ -120,6 +123,7 @@ class HandEnv(LocomotionEnv):
             ticks=task.ticks,
             start_noise=task.start_noise_rad,
             threads=threads,
+            engine=engine,
         )
 
     @property

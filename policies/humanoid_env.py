@@ -26,6 +26,7 @@ from deal_hw.policies.locomotion import (
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import Mirror, check_task
 from deal_hw.policy import CLOCK_AXES, ObservationTerm, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.sim.engine.model import load_model
 from deal_hw.types import FloatArray
 
@@ -181,6 +182,7 @@ class HumanoidEnv(LocomotionEnv):
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
     """
 
     settle_s = 0.0
@@ -193,6 +195,7 @@ class HumanoidEnv(LocomotionEnv):
         *,
         task: StrideTask | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.task = task = task or StrideTask()
         self.failure_reward = -task.fall_cost
@@ -205,13 +208,14 @@ class HumanoidEnv(LocomotionEnv):
             ticks=task.ticks,
             start_noise=task.start_noise_rad,
             threads=threads,
+            engine=engine,
         )
         model = load_model(description).model
         names = [model.geom(k).name for k in range(model.ngeom)]
         # Each foot has two capsules.
         self._capsules = [names.index(n) for side in SIDES for n in names if n.endswith(f"_{side}_foot")]
         self._radius = float(model.geom_size[self._capsules[0], 0])
-        self._places = self.loop.batch.batch.bind("geom_xpos")
+        self._places = self.loop.batch.engine.bind("geom_xpos")
         self._calm = [6 + i for i, name in enumerate(description.joint_names) if _kind(name) in CALM]
 
     def feedback(self) -> FloatArray:

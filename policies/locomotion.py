@@ -15,6 +15,7 @@ from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import ServoVectorEnv
 from deal_hw.policy import AXES, ObservationTerm, PolicySpec, Quantity, base_features
 from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.types import FloatArray
 
 POOL = 64
@@ -42,6 +43,7 @@ class LocomotionEnv(ServoVectorEnv):
         start_noise: Largest deviation of a joint from its settled position [rad].
         host_delay_s: Lowest and highest delay of the host, added to the distribution's latency [s].
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
         step_s: Physics step [s]; the device period by default.
 
     Raises:
@@ -61,6 +63,7 @@ class LocomotionEnv(ServoVectorEnv):
         start_noise: float,
         host_delay_s: tuple[float, float] = (0.0, 0.0),
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
         step_s: float | None = None,
     ) -> None:
         if description.floating_base is None:
@@ -75,6 +78,7 @@ class LocomotionEnv(ServoVectorEnv):
             ticks=ticks,
             host_delay_s=host_delay_s,
             threads=threads,
+            engine=engine,
             step_s=step_s,
         )
         self._start_noise = start_noise

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
@@ -80,7 +81,10 @@ class PpoConfig:
 
 
 class PpoTrainer:
-    """Trains on one CPU core; the same generator state gives the same policy on the same machine."""
+    """Trains on one CPU core; the same generator state gives the same policy on the same machine.
+
+    Where a GPU simulates the environment, the networks are on that GPU, too.
+    """
 
     name = "ppo"
     config = PpoConfig
@@ -152,18 +156,20 @@ class _Learner:
 
     def __init__(self, env: ServoVectorEnv, config: PpoConfig) -> None:
         self._env, self._config = env, config
+        self._device = learning_device(env)
         O, A = len(env.layout.observation), len(env.layout.actuated)  # noqa: E741
         example = self._batch(np.zeros((env.num_envs, O), dtype=np.float32))
         groups = {"actor": ["observation"], "critic": ["observation", "privileged"]}
         spread = {"class_name": "GaussianDistribution", "init_std": config.exploration, "std_type": "log"}
         hidden = list(config.hidden)
-        self._actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
-        self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu")
+        actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
+        self._actor = actor.to(self._device)
+        self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu").to(self._device)
         # Small first actions: learning starts at the default pose, not at a random one.
         with torch.no_grad():
             list(self._actor.mlp)[-1].weight.mul_(0.1)
-        self._feedback = Feedback(env.feedback())
-        storage = RolloutStorage("rl", env.num_envs, config.rollout, example, [A])
+        self._feedback = Feedback(env.feedback()).to(self._device)
+        storage = RolloutStorage("rl", env.num_envs, config.rollout, example, [A], self._device)
         self._ppo = PPO(
             self._actor,
             self._critic,
@@ -176,7 +182,8 @@ class _Learner:
             entropy_coef=config.entropy,
             learning_rate=config.learning_rate,
             desired_kl=config.divergence,
-            symmetry_cfg=_symmetry(env),
+            symmetry_cfg=_symmetry(env, self._device),
+            device=self._device,
         )
         self.steps = self.updates = 0
         self._return = np.zeros(env.num_envs)
@@ -195,15 +202,16 @@ class _Learner:
             for _ in range(config.rollout):
                 check()
                 action = ppo.act(self._seen) + self._feedback(self._seen["observation"])
-                seen, reward, terminated, truncated, _ = self._env.step(action.numpy().astype(np.float64))
+                action = action.cpu().numpy().astype(np.float64)
+                seen, reward, terminated, truncated, _ = self._env.step(action)
                 over = terminated | truncated
                 self._return += reward
                 self._recent.extend(float(x) for x in self._return[over])
                 self._return[over] = 0.0
                 self._seen = self._batch(seen)
-                scaled = torch.as_tensor(reward * config.reward_scale, dtype=torch.float32)
-                ends = {"time_outs": torch.as_tensor(truncated)}
-                ppo.process_env_step(self._seen, scaled, torch.as_tensor(over), ends)
+                scaled = self._tensor((reward * config.reward_scale).astype(np.float32))
+                ends = {"time_outs": self._tensor(truncated)}
+                ppo.process_env_step(self._seen, scaled, self._tensor(over), ends)
             ppo.compute_returns(self._seen)
         losses = ppo.update()
         self.steps += config.rollout * self._env.num_envs
@@ -221,7 +229,9 @@ class _Learner:
         return is_finite(self._actor, self._critic)
 
     def network(self) -> torch.nn.Module:
-        """Return the actor without exploration, as layers."""
+        """Return the actor without exploration, as layers, on the CPU from now on."""
+        self._actor.cpu()
+        self._feedback.cpu()
         if not self._feedback.weight.any():
             return torch.nn.Sequential(*self._actor.mlp, torch.nn.Hardtanh())
         return FeedbackNetwork(torch.nn.Sequential(*self._actor.mlp), self._feedback)
@@ -235,6 +245,7 @@ class _Learner:
         }
         for i, state in self._ppo.optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{name}": value for name, value in state.items()}
+        tensors = {name: value.cpu() for name, value in tensors.items()}
         notes = {
             "trainer": PpoTrainer.name,
             "steps": self.steps,
@@ -276,21 +287,31 @@ class _Learner:
 
     def _batch(self, observation: Observation) -> TensorDict:
         parts = {"observation": observation, "privileged": self._env.privileged().astype(np.float32)}
-        tensors = {name: torch.as_tensor(part) for name, part in parts.items()}
-        return TensorDict(tensors, batch_size=[self._env.num_envs])
+        tensors = {name: self._tensor(part) for name, part in parts.items()}
+        return TensorDict(tensors, batch_size=[self._env.num_envs], device=self._device)
+
+    def _tensor(self, values: npt.NDArray[Any]) -> torch.Tensor:
+        return torch.as_tensor(values, device=self._device)
 
     def _exploration(self) -> float:
         spread: Any = self._actor.distribution
         return float(spread.log_std_param.detach().exp().mean())
 
 
-def _symmetry(env: ServoVectorEnv) -> dict[str, Any] | None:
+def learning_device(env: Any) -> str:
+    """Return torch's name of the device that learns: the GPU where one simulates the environment."""
+    engine = env.loop.batch.engine_name if isinstance(env, ServoVectorEnv) else "mujoco"
+    return "cuda" if engine == "warp" and torch.cuda.is_available() else "cpu"
+
+
+def _symmetry(env: ServoVectorEnv, device: str) -> dict[str, Any] | None:
     """Return rsl-rl's settings to learn from reflections, too; None for a robot without symmetry."""
     mirrors = env.mirror()
     if mirrors is None:
         return None
     (seen, seen_sign), (done, done_sign) = (
-        (list(mirror.source), torch.tensor(mirror.sign, dtype=torch.float32)) for mirror in mirrors
+        (list(mirror.source), torch.tensor(mirror.sign, dtype=torch.float32, device=device))
+        for mirror in mirrors
     )
 
     def augment(env: Any, obs: Any, actions: torch.Tensor | None) -> tuple[Any, torch.Tensor | None]:

@@ -13,6 +13,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import ServoVectorEnv, check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.types import FloatArray
 
 
@@ -82,6 +83,7 @@ class ReachEnv(ServoVectorEnv):
         task: The settings.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class ReachEnv(ServoVectorEnv):
         task: ReachTask | None = None,
         sensor: SensorModel | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.task = task or ReachTask()
         super().__init__(
@@ -104,6 +107,7 @@ class ReachEnv(ServoVectorEnv):
             host_delay_s=self.task.host_delay_s,
             sensor=sensor,
             threads=threads,
+            engine=engine,
         )
         self._ends = np.array(self.layout.target_range).T
         self._joints = list(description.actuated_index)

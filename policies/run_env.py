@@ -21,6 +21,7 @@ from deal_hw.policies.locomotion import (
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.types import FloatArray
 
 
@@ -81,6 +82,7 @@ class RunEnv(LocomotionEnv):
         count: Members N.
         task: The settings.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
     """
 
     failure_reward = 0.0
@@ -93,6 +95,7 @@ class RunEnv(LocomotionEnv):
         *,
         task: RunTask | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
     ) -> None:
         self.task = task or RunTask()
         super().__init__(
@@ -103,6 +106,7 @@ class RunEnv(LocomotionEnv):
             ticks=self.task.ticks,
             start_noise=self.task.start_noise_rad,
             threads=threads,
+            engine=engine,
         )
 
     def reward(

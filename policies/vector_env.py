@@ -19,6 +19,7 @@ from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
+from deal_hw.sim.engine.engines import EngineName
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray
 
@@ -100,6 +101,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
             of the newest state sample when the policy reads it, and the time on the wire.
         sensor: The sensor model; the description's by default.
         threads: Threads of the physics; None for all CPUs.
+        engine: What simulates the physics.
         step_s: Physics step [s]; the device period by default.
 
     Attributes:
@@ -120,6 +122,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
         host_delay_s: tuple[float, float],
         sensor: SensorModel | None = None,
         threads: int | None = 1,
+        engine: EngineName = "mujoco",
         step_s: float | None = None,
     ) -> None:
         self.description, self.distribution, self.layout = description, distribution, layout
@@ -143,6 +146,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
             count,
             sensor=sensor,
             threads=threads,
+            engine=engine,
             step_s=step_s,
             scene=self.scene,
         )

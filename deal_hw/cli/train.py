@@ -12,6 +12,7 @@ from deal_hw.cli.piped import PipedProgress, Quiet, is_quiet
 from deal_hw.documentation import page
 from deal_hw.robots import driven_robots
 from deal_hw.training import TrainingProgress, TrainingStatus
+from deal_hw.workflows.say import silent, to_stderr
 from deal_hw.workflows.train import TRAIN, InterruptedTrainingError, Training, TrainSettings, run
 
 SHOWN_MEASURES = 3
@@ -36,7 +37,7 @@ def train(config: TrainSettings) -> Training:
             training = _with_bar(config)
         else:
             with PipedProgress("train") as piped:
-                training = run(config, lambda status: piped.at(_words(status)))
+                training = run(config, lambda status: piped.at(_words(status)), to_stderr)
     except InterruptedTrainingError as stopped:
         _print(stopped.training)
         print("stopped before the end; --resume continues from the checkpoint")
@@ -79,7 +80,7 @@ def _with_bar(config: TrainSettings) -> Training:
         disable=is_quiet(config),
     )
     try:
-        return run(config, _follow(bar))
+        return run(config, _follow(bar), silent if is_quiet(config) else to_stderr)
     finally:
         if bar.live.is_started:
             bar.stop()

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import numpy as np
 
@@ -21,13 +21,14 @@ from deal_hw.reading import read_json, reading
 from deal_hw.robots import robot_entry, trained_robots
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
-from deal_hw.workflows.options import FROM_PYTHON, File, Seed, from_settings
+from deal_hw.workflows.options import FROM_PYTHON, File, Seed, Threads, from_settings
 from deal_hw.workflows.robot import described, is_user_robot
 from deal_hw.workflows.robot_kinds import FILE
-from deal_hw.workflows.say import html_table, text_table
+from deal_hw.workflows.say import Say, html_table, silent, text_table
 
 if TYPE_CHECKING:
     from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.sim.engine.warp_support import WantedEngine
 
 POLICY_FILE = Path("policies") / "policy.onnx"
 
@@ -98,6 +99,15 @@ class TrainRobotSettings(TrainSettings):
     udr: bool = False
     """Train under uniform domain randomisation (UDR) instead: every parameter within a factor 5 of its
     nominal value (Go2, humanoid and hand: 1.75)."""
+
+    engine: Literal["auto", "mujoco", "warp", "warp-cpu"] = "mujoco"
+    """What simulates the robots. mujoco: one CPU core. warp: MuJoCo Warp on an NVIDIA GPU, where PPO's
+    networks are, too; give --members 4096 or so (extra gpu). auto: warp where there is a GPU, the model can
+    run there and there are enough members, else mujoco. warp-cpu: MuJoCo Warp without a GPU, to try it
+    (docs/how-to/gpu.md)."""
+
+    threads: Threads = 1
+    """Simulation threads of mujoco; a policy does not depend on them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,8 +234,8 @@ def train(settings: TrainSettings) -> Training:
     return run(settings, settings.progress)
 
 
-def run(config: TrainSettings, progress: TrainingProgress) -> Training:
-    """Train a policy, as :func:`train`, and show the progress."""
+def run(config: TrainSettings, progress: TrainingProgress, say: Say = silent) -> Training:
+    """Train a policy, as :func:`train`, show the progress, and say what simulates."""
     out = Path(config.out)
     path = out if out.suffix == ".onnx" else out / POLICY_FILE
     distribution, verdict = _distribution(config)
@@ -267,6 +277,9 @@ def run(config: TrainSettings, progress: TrainingProgress) -> Training:
             verdict=verdict,
             env=config.env if isinstance(config, TrainOwnSettings) else "",
             task=config.task if isinstance(config, TrainTaskSettings) else "",
+            engine=config.engine if isinstance(config, TrainRobotSettings) else "mujoco",
+            threads=config.threads if isinstance(config, TrainRobotSettings) else 1,
+            say=say,
         )
     training = Training(
         policy=policy,
@@ -295,6 +308,9 @@ def train_policy(
     verdict: str = "",
     env: str = "",
     task: str = "",
+    engine: WantedEngine = "mujoco",
+    threads: int | None = 1,
+    say: Say = silent,
 ) -> OnnxPolicy:
     """Train a policy and write it with its training record.
 
@@ -311,6 +327,9 @@ def train_policy(
         verdict: Colour of the distribution's calibration; "" if it is of none.
         env: Environment of a user, module:ENV_ID; "" for the robot's own task.
         task: Name of one of the robot's further tasks; "" for its usual one.
+        engine: What simulates the robots of a task of ours.
+        threads: Threads of that; None for all CPUs.
+        say: Called with a sentence on that.
 
     Returns:
         The policy, read back from its file.
@@ -324,8 +343,12 @@ def train_policy(
 
     chosen = OWN_TASK if env else training_task(robot, task)
     teacher, config = chosen.trainer_and_config(trainer, steps)
-    own = (env,) if env else ()
-    world = chosen.make(*own, described(robot), distribution, members or chosen.members[teacher.name])
+    count, description = members or chosen.members[teacher.name], described(robot)
+    if env:
+        world = chosen.make(env, description, distribution, count)
+    else:
+        simulator = _simulator(robot, engine, threads, count, say)
+        world = chosen.make(description, distribution, count, **simulator)
     # An unwritable path is reported now and not after the training.
     path.parent.mkdir(parents=True, exist_ok=True)
     started, cpu = time.monotonic(), time.process_time()
@@ -351,12 +374,28 @@ def train_policy(
         "reached": dataclasses.asdict(reached[0]) if reached else {},
         "started_from": str(files.start or "") if files is not None else "",
         "seconds": spent.get("seconds", 0.0) + time.monotonic() - started,
+        "engine": "mujoco" if env else world.loop.batch.engine_name,
         "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
         "resumed": files is not None and files.resume,
     }
     # `deploy` reads the calibration's verdict from the policy.
     training = {**policy.spec.training, **({VERDICT: verdict} if verdict else {})}
     return export_network(policy.network, dataclasses.replace(policy.spec, training=training), path, record)
+
+
+def _simulator(
+    robot: str, wanted: WantedEngine, threads: int | None, members: int, say: Say
+) -> dict[str, Any]:
+    """Return an environment's arguments of what simulates it, and say it; none where it is the usual."""
+    if wanted != "mujoco":
+        from deal_hw.sim.engine.model import load_model
+        from deal_hw.sim.engine.warp_support import choose_engine
+
+        engine = choose_engine(wanted, load_model(described(robot)), members, "the training", say)
+        if engine != "mujoco":
+            # Beside a GPU all processors derive the constants of restarted robots.
+            return {"engine": engine, "threads": None}
+    return {} if threads == 1 else {"threads": threads}
 
 
 def _spent(record: Path) -> dict[str, float]:

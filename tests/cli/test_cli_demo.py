@@ -39,7 +39,6 @@ from deal_hw.findings import Finding, Severity
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.training import TrainingProgress
 from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.walk_script import HELDOUT, Walk
@@ -326,7 +325,7 @@ def test_a_signal_ends_the_demo_in_each_job(
 
     training = run_training
 
-    def pressed_in_training(config: TrainSettings, _: TrainingProgress | None = None) -> Training:
+    def pressed_in_training(config: TrainSettings, *_: Any) -> Training:
         return training(config, lambda status: signal.raise_signal(number))
 
     def begin(name: str, result: Any = None) -> None:

@@ -15,6 +15,7 @@ from deal_hw.cli.piped import PipedProgress
 from deal_hw.clock import VirtualClock
 from deal_hw.control.process.channel import HOMING, MAKING_PASSIVE, RUNNING, Beat
 from deal_hw.training import TrainingStatus
+from deal_hw.workflows.say import Say
 
 
 class Lines:
@@ -141,7 +142,7 @@ def test_train(lines: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, return and the task's measures."""
     reported: list[str] = []
 
-    def run(config: Any, follow: Callable[[TrainingStatus], None]) -> Any:
+    def run(config: Any, follow: Callable[[TrainingStatus], None], say: Say) -> Any:
         follow(TrainingStatus(steps=500, total=2000, mean_return=12.3, measures={"velocity_error_m_s": 0.25}))
         reported.append(lines.after_ten_seconds())
 

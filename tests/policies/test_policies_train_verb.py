@@ -7,6 +7,7 @@ import dataclasses
 import json
 import signal
 import types
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import VERDICT
 from deal_hw.robots import driver_description
+from deal_hw.sim.engine import warp_support
 from deal_hw.training import TrainingProgress, TrainingStatus
 from deal_hw.workflows.train import TrainSettings, read_distribution, udr_distribution
 
@@ -59,6 +61,81 @@ def test_a_distribution_from_a_file_makes_a_policy_for_the_robot(
     assert record["training"]["members"] == 8
     assert record["seed"] == 4
     assert record["reward"].endswith("which has the effect of an alive bonus.")
+
+
+def test_threads_change_no_policy(tmp_path: Path) -> None:
+    """The same checkpoint with one thread and with two, and the record names the engine."""
+    made = []
+    for threads in (1, 2):
+        training = train(
+            TRAIN.settings(
+                udr=True, trainer="ppo", out=tmp_path / str(threads), steps=STEPS, members=8, threads=threads,
+                quiet=True,
+            )
+        )  # fmt: skip
+        made.append(training.checkpoint.read_bytes())
+        record = json.loads(training.record.read_text(encoding="utf-8"))
+        assert record["engine"] == "mujoco"
+    assert made[0] == made[1]
+
+
+def test_a_gpu_that_is_not_there_is_said_before_the_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the remedy; --engine auto goes on without it, and says why."""
+    monkeypatch.setattr(warp_support, "gpu_problem", lambda: "no NVIDIA driver is installed")
+    monkeypatch.setattr(warp_support, "find_spec", lambda name: True)
+    with pytest.raises(ConfigurationError, match=r"needs a GPU, and no NVIDIA driver .* --engine mujoco"):
+        train(TRAIN.settings(udr=True, engine="warp", out=tmp_path / "none"))
+    assert not (tmp_path / "none").exists()
+    made = train(TRAIN.settings(udr=True, engine="auto", out=tmp_path, steps=STEPS, members=8))
+    assert "mujoco simulates the training: --engine warp needs a GPU" in capsys.readouterr().err
+    assert made.path.exists()
+
+
+@pytest.mark.parametrize(
+    ("engine", "gpu", "device"), [("warp", True, "cuda"), ("warp", False, "cpu"), ("mujoco", True, "cpu")]
+)
+def test_ppo_learns_where_the_robots_are_simulated(
+    engine: str, gpu: bool, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a GPU only if one simulates, and torch can use it."""
+    import torch
+
+    from deal_hw.policies.cartpole_env import CartPoleEnv
+    from deal_hw.policies.ppo import learning_device
+
+    env = CartPoleEnv(DESCRIPTION, udr_distribution("cartpole"), 2)
+    vars(env.loop.batch)["engine_name"] = engine
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    assert learning_device(env) == device
+    assert learning_device(object()) == "cpu"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo Warp is not installed (extra gpu)")
+def test_a_policy_of_warp_runs_on_mujoco(tmp_path: Path) -> None:
+    """Two updates on its CPU device: the first observations agree, so the first returns nearly do."""
+    made = [
+        train(
+            TRAIN.settings(
+                udr=True,
+                trainer="ppo",
+                engine=engine,
+                out=tmp_path / engine,
+                steps=STEPS,
+                members=16,
+                quiet=True,
+            )
+        )
+        for engine in ("mujoco", "warp-cpu")
+    ]
+    records = [json.loads(training.record.read_text(encoding="utf-8")) for training in made]
+    assert [record["engine"] for record in records] == ["mujoco", "warp-cpu"]
+    first = [training.first_return for training in made]
+    assert first[0] is not None and first[1] == pytest.approx(first[0], rel=0.02)
+    seen = np.zeros((1, len(made[1].policy.spec.observation)), dtype=np.float32)
+    np.testing.assert_allclose(made[1].policy.act_batch(seen), made[0].policy.act_batch(seen), atol=0.05)
 
 
 @pytest.mark.parametrize(("robot", "reported"), [("cartpole", True), ("ant", False)])
