@@ -6,7 +6,11 @@ over their search range, from the rest pose, under random set-points, read after
 generation of `calibrate` asks. `bare_ratio` is its time over that of as many bare steps of MuJoCo Warp in the
 same worlds, without controls, records and copies. The first rollout, which compiles, is said apart.
 
+With --environments a row is a tick of the task's training environment with as many robots, under random
+actions: physics, observations, rewards and restarts, without the learning.
+
 .venv/bin/python tools/measure_engines.py --worlds 256,1024,4096,16384,32768 --out engines.json
+.venv/bin/python tools/measure_engines.py --environments --tasks go2 --worlds 1024,2048,4096 --out ticks.json
 .venv/bin/python tools/measure_engines.py --engine mujoco,warp-cpu --tasks cartpole --worlds 4 --steps 20
 """
 
@@ -19,9 +23,11 @@ from typing import Any
 import numpy as np
 from measuring import Rows, parser
 
-from deal_hw.robots.registry import parameter_spaces, robot_description
+from deal_hw.robots.registry import parameter_spaces, robot_description, training_task
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.engine.model import load_model
+from deal_hw.workflows.robot import described
+from deal_hw.workflows.train import udr_distribution
 
 TASKS = ("cartpole", "ant", "allegro", "go2", "humanoid")
 MOST_MEMBERS = 256
@@ -62,6 +68,29 @@ def measure(task: str, engine: Any, worlds: int, steps: int, repeats: int) -> di
     return row
 
 
+def measure_environment(task: str, engine: Any, members: int, ticks: int) -> dict[str, Any]:
+    """Return the row of a training environment, whose robots are anywhere in their episodes."""
+    made = training_task(task)
+    distribution = udr_distribution(task)
+    threads = None if engine == "mujoco" else default_threads()
+    env = made.make(described(task), distribution, members, engine=engine, threads=threads)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    env._elapsed[:] = rng.integers(0, env.ticks, members)
+
+    def tick() -> None:
+        env.step(rng.uniform(-0.3, 0.3, env.action_space.shape))
+
+    row: dict[str, Any] = {"task": task, "engine": engine, "members": members, "ticks": ticks}
+    row["threads"] = default_threads()
+    row["first_s"] = seconds(tick, 1)
+    began = time.perf_counter()
+    for _ in range(ticks):
+        tick()
+    row["tick_s"] = (time.perf_counter() - began) / ticks
+    return row | {"steps_per_s": members / row["tick_s"]}
+
+
 def seconds(work: Callable[[], None], repeats: int) -> float:
     """Return the shortest time [s] of so many."""
     found = []
@@ -79,13 +108,18 @@ def main() -> None:
     options.add_argument("--tasks", default=",".join(TASKS))
     options.add_argument("--worlds", default="256,512,1024,2048,4096,8192,16384,32768")
     options.add_argument("--steps", type=int, default=200, help="physics steps of a rollout")
+    options.add_argument("--environments", action="store_true", help="ticks of training environments instead")
+    options.add_argument("--ticks", type=int, default=20, help="ticks of an environment")
     options.add_argument("--repeats", type=int, default=3, help="rollouts, of which the fastest counts")
     args = options.parse_args()
     rows = Rows(__file__, args.out)
     for task in args.tasks.split(","):
         for engine in args.engine.split(","):
             for worlds in map(int, args.worlds.split(",")):
-                rows.add(measure(task, engine, worlds, args.steps, args.repeats))
+                if args.environments:
+                    rows.add(measure_environment(task, engine, worlds, args.ticks))
+                else:
+                    rows.add(measure(task, engine, worlds, args.steps, args.repeats))
 
 
 if __name__ == "__main__":

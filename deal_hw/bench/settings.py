@@ -348,6 +348,10 @@ class Speed(TaskBench):
     range_ratio: Annotated[float, Ratio] = 5.0
     """Ratio of the search range."""
 
+    engine: Literal["mujoco", "warp", "warp-cpu"] = "mujoco"
+    """What simulates the search's population, as for `deal-hw calibrate`: warp for the methods deal and eki,
+    on an NVIDIA GPU (docs/how-to/gpu.md)."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Real(SearchingBench, SpreadBench):

@@ -14,7 +14,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -26,12 +26,13 @@ from deal_hw.workflows.calibration.run import calibrate_episodes
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calibration import CalibrationResult
+    from deal_hw.sim.engine.engines import EngineName
     from deal_hw.types import FloatArray
 
 REPETITIONS: Final = 5
 """Number of rollouts of bare physics; the median counts."""
 
-KEY: Final = ("task", "space", "method", "population", "generations", "seed")
+KEY: Final = ("task", "space", "method", "population", "generations", "seed", "engine")
 
 
 def table(settings: Speed) -> RowTable:
@@ -49,9 +50,11 @@ def table(settings: Speed) -> RowTable:
         run_cell, profile=settings.profile, range_ratio=settings.range_ratio, threads=settings.threads
     )
     args = []
+    # Rows from before there was another engine have none.
+    engine = "" if settings.engine == "mujoco" else settings.engine
     for task, seed, method in itertools.product(settings.task, settings.seeds, settings.methods):
         members = settings.population or usual_population(method)
-        cell = (task, settings.space, method, members, settings.generations, seed)
+        cell = (task, settings.space, method, members, settings.generations, seed, engine)
         args.append((cell, cell))
     return RowTable(cells=Cells(names=KEY, run=run, args=args), line=line, summary=printed(summary))
 
@@ -63,6 +66,7 @@ def run_cell(
     population: int,
     generations: int,
     seed: int,
+    engine: EngineName | Literal[""] = "",
     *,
     profile: str,
     range_ratio: float,
@@ -77,19 +81,28 @@ def run_cell(
         population: Members of the search.
         generations: Its generations.
         seed: Seed of everything.
+        engine: What simulates the population; "" for mujoco.
         profile: Profile of the robot.
         range_ratio: Ratio of the search range.
         threads: Simulation threads.
     """
     row: Row = {"bench": "speed", "task": task, "space": space, "method": method, "profile": profile}
-    row |= {"population": population, "generations": generations, "seed": seed, "error": ""}
+    row |= {"population": population, "generations": generations, "seed": seed}
+    row |= {"engine": engine, "error": ""}
     with noted_in(row):
         case = make_case(task, profile, seed, range_ratio, space, by_policy=True)
-        row |= measure(case, method, population, generations, threads)
+        row |= measure(case, method, population, generations, threads, engine or "mujoco")
     return row
 
 
-def measure(case: Case, method: str, population: int, generations: int, threads: int | None) -> Row:
+def measure(
+    case: Case,
+    method: str,
+    population: int,
+    generations: int,
+    threads: int | None,
+    engine: EngineName = "mujoco",
+) -> Row:
     """Search once without refinement, then step the engine alone; imports are not counted.
 
     Returns:
@@ -111,6 +124,7 @@ def measure(case: Case, method: str, population: int, generations: int, threads:
             rng=np.random.default_rng(case.seed),
             threads=threads,
             policy=case.policy,
+            engine=engine,
         )
 
     # The first search of a process imports torch, which is no part of a search.
@@ -182,6 +196,8 @@ def bare_step_s(problem: Problem, population: int) -> tuple[float, float]:
 def line(row: Row) -> str:
     """Return one row in words."""
     what = f"speed {row['task']} {row['method']} seed {row['seed']}"
+    if row.get("engine"):
+        what += f" on {row['engine']}"
     if row["error"]:
         return f"{what}: {row['error']}"
     paper = f", the paper's {row['paper_seconds']:.0f} s" if row["paper_seconds"] else ""
@@ -198,15 +214,14 @@ def summary(rows: Sequence[Row]) -> list[str]:
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         if not row["error"]:
-            groups.setdefault((row["task"], row["method"], row["population"], row["generations"]), []).append(
-                row
-            )
-    for (task, method, population, generations), group in groups.items():
+            what = row["method"] + (f" on {row['engine']}" if row.get("engine") else "")
+            groups.setdefault((row["task"], what, row["population"], row["generations"]), []).append(row)
+    for (task, what, population, generations), group in groups.items():
         seconds, ratio = (statistics.median(row[name] for row in group) for name in ("seconds", "ratio"))
         paper = TASKS[task].paper_s if task in TASKS else None
         beside = f"; the paper: {paper:.0f} s on a GPU" if paper else ""
         found.append(
-            f"{task} {method}, {population} x {generations}: {seconds:.1f} s, {ratio:.2f} times bare physics"
+            f"{task} {what}, {population} x {generations}: {seconds:.1f} s, {ratio:.2f} times bare physics"
             f"{beside}"
         )
     return found

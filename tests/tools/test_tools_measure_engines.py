@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import pytest
-from measure_engines import TASKS, measure
+from measure_engines import TASKS, measure, measure_environment
 
 from deal_hw.robots.registry import parameter_spaces
 
@@ -16,6 +16,13 @@ def test_a_row_counts_the_steps_of_all_worlds(task: str) -> None:
     row = measure(task, "mujoco", 6, 20, 1)
     assert (row["worlds"], row["steps"], row["diverged"]) == (6, 20, 0)
     assert row["steps_per_s"] == pytest.approx(120 / row["seconds"])
+
+
+def test_a_row_of_an_environment_counts_its_ticks() -> None:
+    """Three ticks of four cart-poles."""
+    row = measure_environment("cartpole", "mujoco", 4, 3)
+    assert (row["members"], row["ticks"]) == (4, 3)
+    assert row["steps_per_s"] == pytest.approx(4 / row["tick_s"])
 
 
 def test_tasks_are_those_of_the_paper() -> None:
