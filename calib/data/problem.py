@@ -438,7 +438,9 @@ class Problem:
         return self._batches.get(count, self.episodes[index].setup, self.engine if population else "mujoco")
 
     def batches(self, count: int, index: int) -> list[ServoBatch]:
-        """Return simulators with ``count`` members in all, one for each thread, as :meth:`batch`."""
+        """Return simulators of a search's population of ``count`` members: on a CPU one for each thread."""
+        if self.engine != "mujoco":
+            return [self.batch(count, index, population=True)]
         return self._batches.parts(count, self.episodes[index].setup)
 
     def acts(self, index: int) -> Mask:

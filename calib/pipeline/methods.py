@@ -82,11 +82,15 @@ NO_DATA_METHODS = frozenset(
 )
 """Baselines that must not read the data. They are never refined."""
 
-ENGINE_SEARCHES = frozenset({"deal", "deal-critic", "deal-untrained", "deal-no-critic", "eki", "random"})
-"""Searches whose populations the problem's engine simulates; all others take mujoco.batch."""
-
 UNALIGNED_METHODS = frozenset({"deal-unaligned", "mmd-unaligned", "moments-unaligned"})
 """Searches that compare distributions. A refinement would align what they do not."""
+
+ENGINE_SEARCHES = (
+    frozenset({"deal", *SEARCH_VARIANTS, "eki", "random"})
+    | {name for name in METHODS if name.startswith("deal-paper")} - NO_DATA_METHODS
+    | UNALIGNED_METHODS
+)
+"""Searches whose populations the problem's engine simulates; all others take mujoco.batch."""
 
 CLOSED_LOOP_METHODS = UNALIGNED_METHODS | frozenset(
     {

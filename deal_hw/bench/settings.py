@@ -349,7 +349,7 @@ class Speed(TaskBench):
     """Ratio of the search range."""
 
     engine: Literal["mujoco", "warp", "warp-cpu"] = "mujoco"
-    """What simulates the search's population, as for `deal-hw calibrate`: warp for the methods deal and eki,
+    """What simulates the search's population, as for `deal-hw calibrate`: warp for deal, eki and deal-paper,
     on an NVIDIA GPU (docs/how-to/gpu.md)."""
 
 

@@ -10,10 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from deal_hw.bench.tasks import make_case
+from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import run_identity
 from deal_hw.calib.data.search import Search
 from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.paper.algorithm1 import paper
+from deal_hw.calib.paper.rollouts import control_ticks, policy_of, rollout_population
 from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calibration import Budget, CalibrationResult
@@ -64,6 +68,44 @@ def test_only_populations_are_on_the_chosen_engine(
     made.clear()
     refine(problem, noisy.theta, noisy.latency_s, (0.1,))
     assert made and all(name == "mujoco" for name, _ in made)
+
+
+@pytest.fixture
+def in_loop() -> Problem:
+    """A cart-pole that a policy moves, which every simulator runs, too."""
+    case = make_case("cartpole", "ideal", 1, 5.0, by_policy=True)
+    return Problem(case.robot, case.space, [case.fit], threads=1, policy=case.policy)
+
+
+def test_a_policy_runs_in_the_populations_of_the_chosen_engine(
+    in_loop: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One simulator of all members there, where MuJoCo has one for each thread; with the same numbers."""
+    made: list[tuple[str, int]] = []
+
+    def make(
+        name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
+    ) -> Engine:
+        made.append((name, count))
+        return MujocoEngine(model, nominal, count, threads)
+
+    monkeypatch.setattr(simulators, "make_engine", make)
+    found = [searched(on(in_loop, engine), paper()) for engine in ("mujoco", "warp")]
+    np.testing.assert_array_equal(found[1].estimate, found[0].estimate)
+    assert {count for name, count in made if name == "warp"} == {BUDGET.population}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo Warp is not installed (extra gpu)")
+def test_a_policy_does_the_same_on_warp(in_loop: Problem) -> None:
+    """Eight ticks in closed loop with latencies of their own; then rounding grows where friction turns."""
+    rng = np.random.default_rng(0)
+    members = Members(in_loop.space.sample(rng, 4), rng.uniform(0.0, 0.02, 4))
+    ticks = control_ticks(in_loop, 0, 8, policy_of(in_loop).history)
+    found = [rollout_population(on(in_loop, engine), members, 0, ticks) for engine in ("mujoco", "warp-cpu")]
+    for first, second in zip(*found, strict=True):
+        assert np.isfinite(first).all()
+        np.testing.assert_allclose(second, first, atol=2e-4)
 
 
 def test_a_search_is_resumed_on_its_own_engine_only(noisy_problem: Problem) -> None:

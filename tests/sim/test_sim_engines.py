@@ -170,7 +170,7 @@ def test_without_a_driver_only_auto_goes_on(
         ("mujoco", 1000, "", "mujoco", ""),
         ("auto", 1000, "", "warp", "on the GPU, in float32"),
         ("auto", 10, "", "mujoco", "10 members are too few"),
-        ("auto", 1000, "local", "mujoco", "the method local does not have"),
+        ("auto", 1000, "local", "mujoco", "the method local has none"),
         ("warp", 10, "", "warp", "on the GPU, in float32"),
         ("warp-cpu", 10, "", "warp-cpu", "60 times slower"),
     ],

@@ -247,7 +247,7 @@ def test_importing_the_package_loads_nothing() -> None:
     ("engine", "words"),
     [
         ("auto", "mujoco simulates the search: --engine auto simulates the populations of --search deal"),
-        ("warp", "the method nominal does not have; leave it out"),
+        ("warp", "the method nominal has none; leave it out"),
     ],
 )
 def test_an_engine_is_chosen_before_the_run(

@@ -123,8 +123,8 @@ def choose_engine(
     try:
         if without:
             raise ConfigurationError(
-                f"--engine {wanted} simulates the populations of --search deal and eki, which the method "
-                f"{without} does not have; leave it out"
+                f"--engine {wanted} simulates the populations of --search deal, eki and deal-paper, and the "
+                f"method {without} has none; leave it out"
             )
         for name, model in {"": robot, **robot.setups}.items():
             check_model(model.model, f"the set-up {name}" if name else "the model")
