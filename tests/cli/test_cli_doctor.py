@@ -23,7 +23,7 @@ from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding, Severity
-from deal_hw.sim.engine import gpu
+from deal_hw.sim.engine import gpu, warp_check
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults
 from deal_hw.workflows.doctor import machine
 from deal_hw.workflows.doctor.examine import DoctorReport, examine_robot, judge_interfaces
@@ -94,9 +94,36 @@ def test_a_gpu_is_looked_for_where_its_packages_are(
     """Without MuJoCo Warp nothing is said; without a GPU, why --engine warp is refused."""
     monkeypatch.setattr(machine, "_version", lambda name: version)
     monkeypatch.setattr(gpu, "gpu_problem", lambda: problem)
+    monkeypatch.setattr(warp_check, "difference_from_mujoco", lambda: 1e-7)
     findings = list(machine._gpu())
     assert [finding.severity for finding in findings] == found
     assert all(problem in finding.seen for finding in findings)
+
+
+@pytest.mark.parametrize(
+    ("difference", "severity", "words"),
+    [
+        (1.6e-7, Severity.OK, "to 2e-07 rad"),
+        (0.01, Severity.WARN, "less than 1e-05 rad is expected"),
+        (float("nan"), Severity.WARN, "less than 1e-05 rad is expected"),
+        (RuntimeError("CUDA error 35"), Severity.WARN, "cannot simulate a pendulum: CUDA error 35"),
+    ],
+)
+def test_a_gpu_is_compared_with_mujoco(
+    monkeypatch: pytest.MonkeyPatch, difference: float | Exception, severity: Severity, words: str
+) -> None:
+    """An error and a difference have a remedy."""
+
+    def compared() -> float:
+        if isinstance(difference, Exception):
+            raise difference
+        return difference
+
+    monkeypatch.setattr(machine, "_version", lambda name: "4.0.0")
+    monkeypatch.setattr(gpu, "gpu_problem", lambda: "")
+    monkeypatch.setattr(warp_check, "difference_from_mujoco", compared)
+    (finding,) = machine._gpu()
+    assert finding.severity is severity and words in f"{finding.seen}; {finding.do}"
 
 
 def test_a_robot_that_is_not_there_is_a_finding(capsys: pytest.CaptureFixture[str]) -> None:

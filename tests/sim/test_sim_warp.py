@@ -24,6 +24,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.engines import EngineName, make_engine
 from deal_hw.sim.engine.gpu import gpu_problem
 from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.engine.warp_check import difference_from_mujoco
 from deal_hw.sim.parameters import KIND_TABLE, KINDS, apply_parameters
 from deal_hw.types import FloatArray
 from deal_hw.workflows.robot import described
@@ -77,6 +78,12 @@ def test_rollouts_agree(robot: RobotModel) -> None:
     np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-5)
     np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-4)
     assert np.abs(found[0][0]).max() > 0.05
+
+
+@slow
+def test_doctors_pendulum_agrees() -> None:
+    """Far below what doctor takes for a difference, and above nothing: float32 rounds."""
+    assert 0 < difference_from_mujoco(WARP) < 2e-6
 
 
 @slow

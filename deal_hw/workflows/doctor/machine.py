@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.control.process.realtime import FIFO_PRIORITY
+from deal_hw.errors import DealHwError, short
 from deal_hw.findings import Finding, Severity
 from deal_hw.install import install_line
 
@@ -31,6 +32,7 @@ PACKAGES: Final = (
 _LEAST_LOCK_BYTES: Final = 512 << 20
 _COARSE_S: Final = 1e-5
 _LEAST_RECEIVE_BYTES: Final = 200_000
+_AGREES_RAD: Final = 1e-5
 
 
 def examine_machine(packages: Sequence[tuple[str, str]] = PACKAGES) -> Iterator[Finding]:
@@ -62,7 +64,7 @@ def _packages(packages: Sequence[tuple[str, str]]) -> Iterator[Finding]:
 
 
 def _gpu() -> Iterator[Finding]:
-    """Yield whether `calibrate --engine warp` has a GPU, where its packages are installed."""
+    """Yield whether `--engine warp` has a GPU that agrees with MuJoCo, where its packages are installed."""
     if not _version("mujoco-warp"):
         return
     from deal_hw.sim.engine.gpu import gpu_problem
@@ -70,9 +72,22 @@ def _gpu() -> Iterator[Finding]:
     problem = gpu_problem()
     if problem:
         hint = "look at `nvidia-smi`; `--engine mujoco` needs no GPU"
-        yield Finding("gpu", Severity.NOTE, f"{problem}: `calibrate --engine warp` cannot run", hint)
+        yield Finding("gpu", Severity.NOTE, f"{problem}: `--engine warp` cannot run", hint)
+        return
+    from deal_hw.sim.engine.warp_check import difference_from_mujoco
+
+    try:
+        difference = difference_from_mujoco()
+    except (DealHwError, RuntimeError) as err:
+        hint = "update the NVIDIA driver; `--engine mujoco` needs no GPU"
+        yield Finding("gpu", Severity.WARN, f"the GPU cannot simulate a pendulum: {short(str(err))}", hint)
+        return
+    text = f"the GPU simulates a pendulum as MuJoCo does to {difference:.1g} rad in 0.1 s"
+    if difference < _AGREES_RAD:
+        yield Finding("gpu", Severity.OK, text)
     else:
-        yield Finding("gpu", Severity.OK, "the NVIDIA driver reports a GPU for `calibrate --engine warp`")
+        hint = f"less than {_AGREES_RAD:g} rad is expected in float32: use `--engine mujoco`"
+        yield Finding("gpu", Severity.WARN, text, hint)
 
 
 def _version(name: str) -> str:
