@@ -17,7 +17,7 @@ from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import CLIMBED, OBSTACLE_AXES, ObservationTerm, PolicySpec
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.legged.terrain import EDGE_M, BatchPlatforms, Terrain, terrain_geoms, with_terrain
 from deal_hw.types import FloatArray

@@ -26,7 +26,7 @@ from deal_hw.policies.locomotion import (
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import CLOCK_AXES, Observation, ObservationTerm, PolicySpec
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.types import FloatArray, JointCommand

@@ -17,7 +17,7 @@ from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
 from deal_hw.policy import Observation, PolicySpec
 from deal_hw.rotations import rotation_between
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.types import FloatArray
 
 _UP = 2

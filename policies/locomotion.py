@@ -15,7 +15,7 @@ from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import ServoVectorEnv
 from deal_hw.policy import AXES, ObservationTerm, PolicySpec, Quantity, base_features
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.types import FloatArray
 
 POOL = 64

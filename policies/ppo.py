@@ -31,7 +31,7 @@ from deal_hw.policies.network_policy import (
     trained_spec,
 )
 from deal_hw.policies.training_log import TrainingLog
-from deal_hw.policies.vector_env import ServoVectorEnv
+from deal_hw.policies.vector_env import ServoVectorEnv, TaskKnowledge
 from deal_hw.policy import Observation
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 
@@ -298,10 +298,9 @@ class _Learner:
         return float(spread.log_std_param.detach().exp().mean())
 
 
-def learning_device(env: Any) -> str:
+def learning_device(env: TaskKnowledge) -> str:
     """Return torch's name of the device that learns: the GPU where one simulates the environment."""
-    engine = env.loop.batch.engine_name if isinstance(env, ServoVectorEnv) else "mujoco"
-    return "cuda" if engine == "warp" and torch.cuda.is_available() else "cpu"
+    return "cuda" if env.engine == "warp" and torch.cuda.is_available() else "cpu"
 
 
 def _symmetry(env: ServoVectorEnv, device: str) -> dict[str, Any] | None:

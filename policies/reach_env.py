@@ -13,7 +13,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import ServoVectorEnv, check_task
 from deal_hw.policy import ObservationTerm, PolicySpec
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.types import FloatArray
 
 

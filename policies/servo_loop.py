@@ -16,7 +16,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, reported
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.types import FloatArray
 

@@ -19,7 +19,7 @@ from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray
 
@@ -55,9 +55,11 @@ class TaskKnowledge:
 
     Attributes:
         layout: Layout of observation and action.
+        engine: What simulates the physics.
     """
 
     layout: PolicySpec
+    engine: EngineName = "mujoco"
 
     def feedback(self) -> FloatArray:
         """Return a fixed linear part of the policy, (A, O), that PPO adds to its network; zero by default."""
@@ -128,6 +130,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
         self.description, self.distribution, self.layout = description, distribution, layout
         self.num_envs = count
         self.ticks = ticks
+        self.engine = engine
         self.host_delay_s = host_delay_s
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         O, A = len(layout.observation), len(layout.actuated)  # noqa: E741

@@ -70,10 +70,8 @@ def measure(task: str, engine: Any, worlds: int, steps: int, repeats: int) -> di
 
 def measure_environment(task: str, engine: Any, members: int, ticks: int) -> dict[str, Any]:
     """Return the row of a training environment, whose robots are anywhere in their episodes."""
-    made = training_task(task)
-    distribution = udr_distribution(task)
-    threads = None if engine == "mujoco" else default_threads()
-    env = made.make(described(task), distribution, members, engine=engine, threads=threads)
+    given = described(task), udr_distribution(task), members
+    env = training_task(task).make(*given, engine=engine, threads=None)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     env._elapsed[:] = rng.integers(0, env.ticks, members)

@@ -30,7 +30,7 @@ from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
 from deal_hw.sim.engine.effort import effort_joints
-from deal_hw.sim.engine.engines import EngineName
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.parameters.effort import EFFORT_NOISE

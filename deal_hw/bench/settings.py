@@ -17,6 +17,7 @@ from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
 from deal_hw.scale.where import task_map
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.task_map import TaskMap
 from deal_hw.workflows.calibration.settings import Recordings
 from deal_hw.workflows.options import OneWord, Ratio, RayPlace, Threads
@@ -348,7 +349,7 @@ class Speed(TaskBench):
     range_ratio: Annotated[float, Ratio] = 5.0
     """Ratio of the search range."""
 
-    engine: Literal["mujoco", "warp", "warp-cpu"] = "mujoco"
+    engine: EngineName = "mujoco"
     """What simulates the search's population, as for `deal-hw calibrate`: warp for deal, eki and deal-paper,
     on an NVIDIA GPU (docs/how-to/gpu.md)."""
 

@@ -26,7 +26,7 @@ from deal_hw.workflows.calibration.run import calibrate_episodes
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calibration import CalibrationResult
-    from deal_hw.sim.engine.engines import EngineName
+    from deal_hw.sim.engine.gpu import EngineName
     from deal_hw.types import FloatArray
 
 REPETITIONS: Final = 5

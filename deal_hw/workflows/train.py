@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from deal_hw.policy import VERDICT
 from deal_hw.ranges import Checked, Range
 from deal_hw.reading import read_json, reading
 from deal_hw.robots import robot_entry, trained_robots
+from deal_hw.sim.engine.gpu import WantedEngine
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, File, Seed, Threads, from_settings
@@ -28,7 +29,6 @@ from deal_hw.workflows.say import Say, html_table, silent, text_table
 
 if TYPE_CHECKING:
     from deal_hw.policies.onnx_runtime import OnnxPolicy
-    from deal_hw.sim.engine.warp_support import WantedEngine
 
 POLICY_FILE = Path("policies") / "policy.onnx"
 
@@ -100,7 +100,7 @@ class TrainRobotSettings(TrainSettings):
     """Train under uniform domain randomisation (UDR) instead: every parameter within a factor 5 of its
     nominal value (Go2, humanoid and hand: 1.75)."""
 
-    engine: Literal["auto", "mujoco", "warp", "warp-cpu"] = "mujoco"
+    engine: WantedEngine = "mujoco"
     """What simulates the robots. mujoco: one CPU core. warp: MuJoCo Warp on an NVIDIA GPU, where PPO's
     networks are, too; give --members 4096 or so (extra gpu). auto: warp where there is a GPU, the model can
     run there and there are enough members, else mujoco. warp-cpu: MuJoCo Warp without a GPU, to try it
@@ -374,7 +374,7 @@ def train_policy(
         "reached": dataclasses.asdict(reached[0]) if reached else {},
         "started_from": str(files.start or "") if files is not None else "",
         "seconds": spent.get("seconds", 0.0) + time.monotonic() - started,
-        "engine": "mujoco" if env else world.loop.batch.engine_name,
+        "engine": world.engine,
         "cpu_seconds": spent.get("cpu_seconds", 0.0) + time.process_time() - cpu,
         "resumed": files is not None and files.resume,
     }

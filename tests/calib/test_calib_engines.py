@@ -23,7 +23,8 @@ from deal_hw.calib.search.eki import Eki
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.sim.engine import batch as simulators
 from deal_hw.sim.engine.batch import BatchPool
-from deal_hw.sim.engine.engines import Engine, EngineName, MujocoEngine
+from deal_hw.sim.engine.engines import Engine, MujocoEngine
+from deal_hw.sim.engine.gpu import EngineName
 
 BUDGET = Budget(population=8, generations=2)
 
@@ -34,6 +35,21 @@ def brief(noisy_problem: Problem) -> Problem:
     episode = noisy_problem.episodes[0]
     begun = np.arange(len(episode.sample)) < round(1.0 / episode.period_s)
     return noisy_problem.part([begun])
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Names of engines that were asked for, with their members; all are MuJoCo's."""
+    made: list[tuple[str, int]] = []
+
+    def make(
+        name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
+    ) -> Engine:
+        made.append((name, count))
+        return MujocoEngine(model, nominal, count, threads)
+
+    monkeypatch.setattr(simulators, "make_engine", make)
+    return made
 
 
 def on(problem: Problem, engine: EngineName) -> Problem:
@@ -50,18 +66,9 @@ def searched(problem: Problem, search: Search) -> CalibrationResult:
 
 @pytest.mark.parametrize("search", [Eki(), Deal()], ids=lambda search: search.name)
 def test_only_populations_are_on_the_chosen_engine(
-    noisy: Any, brief: Problem, monkeypatch: pytest.MonkeyPatch, search: Search
+    noisy: Any, brief: Problem, made: list[tuple[str, int]], search: Search
 ) -> None:
     """The search makes one simulator there, of its population; linearisation and refinement make none."""
-    made: list[tuple[str, int]] = []
-
-    def make(
-        name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
-    ) -> Engine:
-        made.append((name, count))
-        return MujocoEngine(model, nominal, count, threads)
-
-    monkeypatch.setattr(simulators, "make_engine", make)
     problem = on(brief, "warp")
     searched(problem, search)
     assert [count for name, count in made if name == "warp"] == [BUDGET.population]
@@ -78,18 +85,9 @@ def in_loop() -> Problem:
 
 
 def test_a_policy_runs_in_the_populations_of_the_chosen_engine(
-    in_loop: Problem, monkeypatch: pytest.MonkeyPatch
+    in_loop: Problem, made: list[tuple[str, int]]
 ) -> None:
     """One simulator of all members there, where MuJoCo has one for each thread; with the same numbers."""
-    made: list[tuple[str, int]] = []
-
-    def make(
-        name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
-    ) -> Engine:
-        made.append((name, count))
-        return MujocoEngine(model, nominal, count, threads)
-
-    monkeypatch.setattr(simulators, "make_engine", make)
     found = [searched(on(in_loop, engine), paper()) for engine in ("mujoco", "warp")]
     np.testing.assert_array_equal(found[1].estimate, found[0].estimate)
     assert {count for name, count in made if name == "warp"} == {BUDGET.population}

@@ -104,12 +104,13 @@ def test_ppo_learns_where_the_robots_are_simulated(
 
     from deal_hw.policies.cartpole_env import CartPoleEnv
     from deal_hw.policies.ppo import learning_device
+    from deal_hw.policies.vector_env import TaskKnowledge
 
     env = CartPoleEnv(DESCRIPTION, udr_distribution("cartpole"), 2)
-    vars(env.loop.batch)["engine_name"] = engine
+    vars(env)["engine"] = engine
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     assert learning_device(env) == device
-    assert learning_device(object()) == "cpu"
+    assert learning_device(TaskKnowledge()) == "cpu"
 
 
 @pytest.mark.slow

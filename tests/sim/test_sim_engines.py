@@ -14,9 +14,9 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.sim.engine import warp_support
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.gpu import gpu_problem
+from deal_hw.sim.engine.gpu import WantedEngine, gpu_problem
 from deal_hw.sim.engine.model import RobotModel, load_model
-from deal_hw.sim.engine.warp_support import WantedEngine, choose_engine, missing_features
+from deal_hw.sim.engine.warp_support import choose_engine, missing_features
 from deal_hw.sim.recordings.episode import align
 from deal_hw.sim.recordings.windows import _groups, cut_windows, predict_windows, setpoints
 

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.effort import TORQUE, EffortSensors, effort_joints
-from deal_hw.sim.engine.engines import EngineName, State, make_engine
+from deal_hw.sim.engine.engines import State, make_engine
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, drop_filters
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
@@ -106,7 +107,6 @@ class ServoBatch:
     Attributes:
         commands: What the drives make of commands; set-points given to :meth:`advance` have passed it.
         effort_joints: Columns of the joints whose effort the parameters describe, (E,).
-        engine_name: What simulates.
         effort: Efforts of these joints at the samples of the last :meth:`advance`, as the robot would report
             them, (N, S // every, E).
     """
@@ -130,7 +130,6 @@ class ServoBatch:
             # Windows begin with positions and velocities: the filters' states follow from the commands.
             model = copy.copy(model)
             drop_filters(model)
-        self.engine_name = engine
         self.engine = make_engine(engine, model, robot.model, count, threads or default_threads())
         self.batch = self.engine.batch
         self._fields = self.engine.fields

@@ -8,7 +8,7 @@ this machine's CPUs, `deal_hw.sim.engine.warp_engine` in float32 on a GPU.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -16,13 +16,12 @@ import numpy.typing as npt
 from mujoco.batch import Batch
 
 from deal_hw.errors import CalibrationError, short
+from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.step_laws import StepLaws, rollout
 from deal_hw.sim.parameters.fields import BatchFields, Fields
 from deal_hw.types import FloatArray
 
 Mask = npt.NDArray[np.bool_]
-
-EngineName = Literal["mujoco", "warp", "warp-cpu"]
 
 State = tuple[FloatArray, FloatArray]
 """Start states of N members in G windows: qpos, (N, G, nq), and qvel, (N, G, nv)."""

@@ -1,11 +1,15 @@
-"""Whether there is a GPU that CUDA can use, without loading a simulator."""
+"""Names of engines, and whether there is a GPU that CUDA can use, without loading a simulator."""
 
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 from deal_hw.errors import short
+
+EngineName: TypeAlias = Literal["mujoco", "warp", "warp-cpu"]
+
+WantedEngine: TypeAlias = Literal["auto", "mujoco", "warp", "warp-cpu"]
 
 CUDA_ERRORS = {100: "it finds no GPU", 802: "the GPU is not ready", 803: "its version is not the kernel's"}
 """Codes of cuInit."""

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, MissingExtraError
-from deal_hw.sim.engine.engines import EngineName
-from deal_hw.sim.engine.gpu import gpu_problem
+from deal_hw.sim.engine.gpu import EngineName, WantedEngine, gpu_problem
 from deal_hw.sim.engine.model import RobotModel
 
 Say: TypeAlias = Callable[[str], None]
@@ -22,8 +21,6 @@ at once, or of a training, which takes one CPU core without a GPU. On an H200 a 
 as do 540 steps on its machine's 16 cores (docs/how-to/gpu.md)."""
 
 _INSTEAD = "use --engine mujoco"
-
-WantedEngine = Literal["auto", "mujoco", "warp", "warp-cpu"]
 
 PACKAGES = {"warp": "warp-lang", "mujoco_warp": "mujoco-warp"}
 """Modules of the extra, and the distributions that have them."""

@@ -96,13 +96,13 @@ def delay(
     whole = np.floor(latency_steps).astype(int)
     part = (latency_steps - whole)[:, None]
     steps = setpoint.shape[1]
-    wanted = np.arange(0 if last is None else steps - last, steps)
+    first = 0 if last is None else steps - last
     # A step before the first is read only where the latency is longer than what comes before a wanted one.
-    longest = max(int(whole.max(initial=0)) + 1 - int(wanted[0] if len(wanted) else 0), 0)
+    longest = max(int(whole.max(initial=0)) + 1 - first, 0)
     padded = setpoint
     if longest:
         padded = np.concatenate([np.repeat(before[:, None], longest, axis=1), setpoint], axis=1)
-    index = longest - whole[:, None] + wanted[:, None]
+    index = longest - whole[:, None] + np.arange(first, steps)[:, None]
     late = np.take_along_axis(padded, index, axis=1)
     if not part.any():
         return late

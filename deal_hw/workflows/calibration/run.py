@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldoutErrors
+    from deal_hw.sim.engine.gpu import WantedEngine
     from deal_hw.sim.engine.model import RobotModel
-    from deal_hw.sim.engine.warp_support import WantedEngine
     from deal_hw.sim.recordings.episode import SampledEpisode
     from deal_hw.workflows.calibration.intake import CalibrationInput
 

@@ -27,6 +27,7 @@ from deal_hw.data.files import dataset_of
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.ranges import Checked, Range
+from deal_hw.sim.engine.gpu import WantedEngine
 from deal_hw.workflows.calibration.source import Division
 from deal_hw.workflows.kinds import InputKind, Kinds, fitting
 from deal_hw.workflows.options import File, Ratio, RayPlace, Seed, Threads
@@ -131,7 +132,7 @@ class CalibrateSettings(Checked):
     threads: Threads = None
     """Simulation threads; by default all CPUs."""
 
-    engine: Literal["auto", "mujoco", "warp", "warp-cpu"] = "mujoco"
+    engine: WantedEngine = "mujoco"
     """What simulates the population of a search (deal, eki, deal-paper); every fit is by mujoco, in float64.
     mujoco: all CPUs. warp: MuJoCo Warp on an NVIDIA GPU, in float32, for populations of hundreds and more
     (extra gpu). auto: warp where there is a GPU, the model can run there and the population is large enough,
