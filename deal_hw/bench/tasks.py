@@ -102,10 +102,14 @@ class _Ask:
         """Return the parameter set with its search ranges."""
         if self.space and self.space not in table:
             raise UnknownNameError("parameter set", self.space, table)
-        space = table[self.space or next(iter(table))]().with_ratio(self.range_ratio)
-        if not self.centred:
-            return space
-        return ParameterSpace(replace(p, scale="linear") for p in space.parameters)
+        space = table[self.space or next(iter(table))]()
+        ratio = self.range_ratio
+        return paper_ranges(space, ratio) if self.centred else space.with_ratio(ratio)
+
+
+def paper_ranges(space: ParameterSpace, range_ratio: float) -> ParameterSpace:
+    """Return the search ranges of DEAL's tables: from nominal / range_ratio to its product, linear."""
+    return ParameterSpace(replace(p, scale="linear") for p in space.with_ratio(range_ratio).parameters)
 
 
 def make_case(
