@@ -24,7 +24,7 @@ from deal_hw.calib.fit.solver import (
     channel_scale,
     correlated_samples,
     huber_weights,
-    solve,
+    solve_parameters,
 )
 from deal_hw.types import FloatArray
 
@@ -39,10 +39,10 @@ class Recipe:
         prior_std: Standard deviation of parameters around their nominal values, as a share of their range in
             its own scale; infinite for none. The default is that of a uniform distribution over the range.
         robust: Large residuals weigh less (Huber).
-        iterations: Most steps of the solver.
-        steps: Steps between two estimates of the residual scale.
-        converged: Relative decrease of the cost in a round of steps below which the fit ends: held-out motion
-            does not show it.
+        iterations: Most derivatives. Each serves up to ``SECANTS`` more steps.
+        steps: Derivatives between two estimates of the residual scale.
+        converged: Relative decrease of the cost between two estimates below which the fit ends: held-out
+            motion does not show it.
         reach: See :class:`deal_hw.calib.fit.solver.SolverSettings`.
         longest_lag_s: Longest lag of the residuals' autocorrelation [s].
     """
@@ -52,11 +52,16 @@ class Recipe:
     prior_std: float = 0.289
     robust: bool = False
     iterations: int = 24
-    steps: int = 6
+    steps: int = 2
     converged: float = 2e-3
     reach: float = 30.0
     longest_lag_s: float = 1.0
 
+
+SECANTS = 3
+"""Most steps that follow a derivative by Broyden's updates. A derivative costs as many simulations as there
+are parameters, a step one. On the real SO-101 fits need half the derivatives then, for residuals that are
+0.05 % larger at most (`converged` allows more)."""
 
 SHORT = Recipe(seconds=0.2)
 """Windows in which even a distant start does not diverge."""
@@ -72,7 +77,7 @@ class OutputErrorFit:
         recipe: The settings.
         scale: Scale of each channel's residuals, (M,): the root mean square; for a robust loss at most the
             scaled median.
-        iterations: Steps used.
+        iterations: Derivatives used.
         plain: The windows, with the sensors' noise.
         weighed: The windows, with ``scale``. An uncertainty counts the residuals' correlation itself.
         point: The solver's point.
@@ -140,8 +145,8 @@ def fit_output_error(
 ) -> OutputErrorFit:
     """Fit from a start, (K,) and latency [s].
 
-    There are at most ``iterations`` steps, the recipe's by default; 0 stays at the start. For ``central`` see
-    :class:`OutputErrorFit`.
+    There are at most ``iterations`` derivatives, the recipe's by default; 0 stays at the start. For
+    ``central`` see :class:`OutputErrorFit`.
 
     Raises:
         InsufficientDataError: No recording holds a window.
@@ -164,11 +169,14 @@ def fit_output_error(
         before = weighed.cost(point)
         # The prior holds insensitive parameters. Autocorrelated residuals weigh too little for one more hold.
         solver = SolverSettings(
-            iterations=min(recipe.steps, left), converged=recipe.converged, reach=recipe.reach
+            iterations=min(recipe.steps, left),
+            converged=recipe.converged,
+            reach=recipe.reach,
+            secants=SECANTS,
         )
-        point, normal, more = solve(weighed, point, solver)
+        point, more = solve_parameters(weighed, point, solver)
         left, used = left - max(more, 1), used + more
-        if not before - normal.cost > recipe.converged * before:
+        if not before - weighed.cost(point) > recipe.converged * before:
             break
     weighed, scale = _weighed(plain, point, recipe, prior_share=np.inf, correlated=False)
     return OutputErrorFit(

@@ -14,7 +14,9 @@ Symbols of :func:`minimise`, for n free unknowns:
     D: half side of the trust region around the present x, a box [-] (``radius``).
     f(x) = |r(x)|^2, and its model m(d) = |r + J d|^2 for a step d.
 The rule for D is algorithm 4.1 of Nocedal and Wright, Numerical Optimization (2006), with a box instead of a
-ball; the bounded linear problem is solved by BVLS (Stark and Parker 1995).
+ball; the bounded linear problem is solved by BVLS (Stark and Parker 1995). With ``secants`` J follows steps
+by Broyden's update (1965), as in section 3.5 of Madsen, Nielsen and Tingleff, Methods for Non-Linear Least
+Squares Problems (2004).
 """
 
 from __future__ import annotations
@@ -76,12 +78,15 @@ class SolverSettings:
         reach: Width of a prior around the start, in the parameters' own scale, which holds insensitive
             parameters. It is as wide as a range of ratio 5, and moves with each new start.
         hopeless: Mean squared residual above which the solver is not started again.
+        secants: Most steps in a row with derivatives that follow from the last ones (Broyden's update), not
+            from simulations.
     """
 
     iterations: int = 12
     converged: float = 1e-4
     reach: float = 1.0
     hopeless: float = np.inf
+    secants: int = 0
 
 
 class LeastSquares(Protocol):
@@ -140,32 +145,49 @@ def minimise(
     left = residual(here)
     if not np.isfinite(left).all():
         return start, 0
-    cost, radius, used = float(left @ left), 1.0, 0
+    cost, radius, used, carried = float(left @ left), 1.0, 0, 0
+    by: FloatArray | None = None
     triangle: FloatArray | None = None
-    for _ in range(settings.iterations):
-        if triangle is None:
+    for _ in range(settings.iterations * (1 + settings.secants)):
+        if by is None:
+            if used == settings.iterations:
+                break
+            by, triangle, carried = jacobian(here), None, 0
             used += 1
+        if triangle is None:
             # [J, -r] = Q R: |r + J d|^2 = |R_J d - R_r|^2, with n + 1 rows instead of M + n.
-            triangle = np.asarray(np.linalg.qr(np.column_stack([jacobian(here), -left]), mode="r"))
+            triangle = np.asarray(np.linalg.qr(np.column_stack([by, -left]), mode="r"))
         rows, wanted = triangle[:, :-1], triangle[:, -1]
         box = np.maximum(lower - here, -radius), np.minimum(upper - here, radius)
         step = lsq_linear(rows, wanted, box, method="bvls", max_iter=10 * len(here)).x
         # The decrease that the model predicts, f(x) - m(d), against the one that comes, f(x) - f(x + d).
         expected = cost - float(np.sum((rows @ step - wanted) ** 2))
         if not expected > 0:
+            if carried:
+                by = None
+                continue
             break
         new, moved = residual(here + step), float(np.abs(step).max())
         gained = cost - float(new @ new) if np.isfinite(new).all() else -np.inf
         # A step that uses nearly all of the box may be cut by it: the box grows only then.
         if gained < POOR * expected:
-            radius = SHRUNK * moved
+            # Carried derivatives may be the reason: a step with new ones comes before a smaller one.
+            radius = SHRUNK * moved if carried == 0 else radius
         elif gained > GOOD * expected and moved > 0.95 * radius:
             radius *= 2.0
         small = SMALLEST_STEP * (SMALLEST_STEP + float(np.linalg.norm(here)))
         ends = float(np.linalg.norm(step)) < small
         if gained > 0:
             ends |= POOR * expected < gained < settings.converged * cost
+            if carried < settings.secants and gained > GOOD * expected:
+                # Broyden (1965): the smallest change of J after which J d = r(x + d) - r(x).
+                by += np.outer((new - left - by @ step) / (step @ step), step)
+                carried += 1
+            else:
+                by = None
             here, left, cost, triangle = here + step, new, cost - gained, None
+        elif carried:
+            by = None
         if ends:
             break
     return at(here), used
@@ -198,6 +220,18 @@ def solve(
         before = normal.cost
     # The rows are large and one-sided; uncertainty uses central differences at the end.
     return point, dataclasses.replace(normal, rows=()), used
+
+
+def solve_parameters(shooting: Shooting, point: Point, settings: SolverSettings) -> tuple[Point, int]:
+    """Solve for parameters alone, from given start states.
+
+    Return the solution and the number of derivatives. There are none at the solution: they cost as many
+    simulations as a step.
+    """
+    fit = _Following(shooting, point, None, None)
+    bounds = value_bounds(shooting.problem)
+    value, used = minimise(fit, point.value, bounds, settings, fixed_latency=shooting.fixed_latency)
+    return fit.at(value), used
 
 
 def converged(

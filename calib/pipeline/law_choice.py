@@ -34,9 +34,9 @@ MOST_LAWS = 2
 """Most laws that are fitted. Around a fit without it a law is often about as good as another one: play and
 friction that falls with speed both delay a joint that turns round."""
 
-FOLD_ITERATIONS, ITERATIONS = 6, 12
-"""Most steps of each fit with a law, in a fold and on all recordings. It begins where that without the law
-ended."""
+FOLD_ITERATIONS, ITERATIONS = 3, 6
+"""Most derivatives of each fit with a law, in a fold and on all recordings. It begins where that without the
+law ended."""
 
 
 @dataclass(frozen=True, slots=True)
