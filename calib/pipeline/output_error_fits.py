@@ -77,6 +77,9 @@ FOLD_STEPS = 2
 SO-101 its error in a fold was then within 7 % of that after up to 24, and the same candidate was chosen.
 After one it still knew what was left out (up to 10 % below), and another one was chosen."""
 
+HALF_STEPS = 2
+"""Most derivatives of the fit of each half, which begins in the minimum of all recordings."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputErrorSettings:
@@ -89,7 +92,6 @@ class OutputErrorSettings:
             ``compared_s`` are no better than a robot whose state stays as it is.
         stretch_s: Recordings are divided into stretches of this length for the search [s].
         compared_s: Window in which start points are compared [s]; short, so that poor ones do not diverge.
-        half_iterations: Most derivatives of the fit of each half.
         mismatch_s: Windows with fitted start states in which the residual is compared with the sensors' noise
             [s]. Errors that build up more slowly do not matter to a controller. 0: the fit's own residual,
             from smoothed start states.
@@ -106,7 +108,6 @@ class OutputErrorSettings:
     search_always: bool = True
     stretch_s: float = 2.5
     compared_s: float = 0.4
-    half_iterations: int = 2
     mismatch_s: float = 0.4
     first: Recipe = SHORT
     robust: bool = False
@@ -401,9 +402,9 @@ class OutputErrorFits(Fits):
         from deal_hw.calib.validation.checks import HALVES, SplitHalf, agreement
         from deal_hw.calib.validation.cross_validation import fold_masks
 
-        before, most, values = problem.steps, self.settings.half_iterations, len(problem.space) + 1
+        before, values = problem.steps, len(problem.space) + 1
         # Derivatives by each value and the latency, each with its steps; central ones at the end.
-        members = most * (values + 1 + SECANTS) + 2 * values
+        members = HALF_STEPS * (values + 1 + SECANTS) + 2 * values
         substeps = problem.episodes[0].step_s / problem.robot.step_s
         cost = float(members * fit.plain.device_periods * substeps)
         if not run.allows(HALVES, cost):
@@ -411,7 +412,7 @@ class OutputErrorFits(Fits):
         parts = map(problem.part, fold_masks(problem, 2))
         try:
             halves = [
-                fit_output_error(part, fit.theta, fit.latency_s, recipe, iterations=most, central=True)
+                fit_output_error(part, fit.theta, fit.latency_s, recipe, iterations=HALF_STEPS, central=True)
                 for part in parts
             ]
         except InsufficientDataError as err:

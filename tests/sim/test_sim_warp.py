@@ -20,8 +20,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.robots.registry import parameter_spaces, robot_description, training_task
-from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.engines import make_engine
+from deal_hw.sim.engine.batch import ServoBatch, make_engine
 from deal_hw.sim.engine.gpu import EngineName, gpu_problem
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.warp_check import difference_from_mujoco

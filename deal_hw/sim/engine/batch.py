@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.effort import TORQUE, EffortSensors, effort_joints
-from deal_hw.sim.engine.engines import State, make_engine
+from deal_hw.sim.engine.engines import Engine, MujocoEngine, State
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, drop_filters
 from deal_hw.sim.engine.step_laws import StepLaws
@@ -64,6 +64,22 @@ if mujoco.get_mju_user_warning() is None:
 def default_threads() -> int:
     """Return the number of CPUs this process may use."""
     return len(os.sched_getaffinity(0))
+
+
+def make_engine(
+    name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
+) -> Engine:
+    """Return an engine; arguments are those of :class:`MujocoEngine`.
+
+    Raises:
+        ConfigurationError: MuJoCo Warp cannot simulate this model, or there is no GPU.
+        MissingExtraError: MuJoCo Warp is not installed.
+    """
+    if name == "mujoco":
+        return MujocoEngine(model, nominal, count, threads)
+    from deal_hw.sim.engine.warp_engine import WarpEngine
+
+    return WarpEngine(model, nominal, count, threads, device="cpu" if name == "warp-cpu" else "cuda")
 
 
 def command_laws(

@@ -16,7 +16,6 @@ import numpy.typing as npt
 from mujoco.batch import Batch
 
 from deal_hw.errors import CalibrationError, short
-from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.step_laws import StepLaws, rollout
 from deal_hw.sim.parameters.fields import BatchFields, Fields
 from deal_hw.types import FloatArray
@@ -149,19 +148,3 @@ class MujocoEngine:
         # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): an increase is a divergence, after which
         # MuJoCo resets the state.
         return np.asarray(self.batch.warning[..., 1].sum(axis=-1), dtype=np.int64)
-
-
-def make_engine(
-    name: EngineName, model: mujoco.MjModel, nominal: mujoco.MjModel, count: int, threads: int
-) -> Engine:
-    """Return an engine; arguments are those of :class:`MujocoEngine`.
-
-    Raises:
-        ConfigurationError: MuJoCo Warp cannot simulate this model, or there is no GPU.
-        MissingExtraError: MuJoCo Warp is not installed.
-    """
-    if name == "mujoco":
-        return MujocoEngine(model, nominal, count, threads)
-    from deal_hw.sim.engine.warp_engine import WarpEngine
-
-    return WarpEngine(model, nominal, count, threads, device="cpu" if name == "warp-cpu" else "cuda")

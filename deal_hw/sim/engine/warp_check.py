@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from deal_hw.sim.engine.engines import make_engine
+from deal_hw.sim.engine.batch import make_engine
 from deal_hw.sim.engine.gpu import EngineName
 
 STEPS = 50
