@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 KEYS = ("time", "dof_pos", "des_dof_pos")
 JOINTS = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
@@ -43,17 +42,20 @@ joints:
 """
 
 
-def convert(source: Path, out: Path, parts: int = 1) -> list[Path]:
+def convert(source: Path, out: Path, parts: int = 1, seconds: float = np.inf) -> list[Path]:
     """Write the NPZ files and the column map and return the paths of the former.
 
     Args:
         source: The torch file.
         out: Folder to write to.
         parts: Number of parts of equal length to write, so that any of them can be held out.
+        seconds: The recording up to this time is taken [s].
 
     Raises:
         SystemExit: The file has other contents than its source describes.
     """
+    import torch
+
     # weights_only, because a torch file is a pickle and could otherwise run any code.
     data = torch.load(source, map_location="cpu", weights_only=True)
     if not isinstance(data, dict) or any(key not in data for key in KEYS):
@@ -63,6 +65,7 @@ def convert(source: Path, out: Path, parts: int = 1) -> list[Path]:
     count = arrays["time"].shape[0]
     if shapes != {"time": (count,), "dof_pos": (count, 12), "des_dof_pos": (count, 12)}:
         raise SystemExit(f"{source} has the shapes {shapes}, expected (T,), (T, 12), (T, 12)")
+    count = int(np.count_nonzero(arrays["time"] - arrays["time"][0] <= seconds))
     out.mkdir(parents=True, exist_ok=True)
     edges = np.linspace(0, count, parts + 1).round().astype(int)
     paths = []
@@ -84,10 +87,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--parts", type=int, default=1, help="number of equal parts to write, to hold one of them out"
     )
+    parser.add_argument(
+        "--seconds", type=float, default=np.inf, help="take the recording up to this time [s] (default: all)"
+    )
     options = parser.parse_args(arguments)
     if options.parts < 1:
         parser.error(f"--parts must be at least 1, got {options.parts}")
-    for path in convert(options.source, options.out, options.parts):
+    if not options.seconds > 0:
+        parser.error(f"--seconds must be above 0, got {options.seconds:g}")
+    for path in convert(options.source, options.out, options.parts, options.seconds):
         print(path)
     return 0
 
