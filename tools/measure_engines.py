@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from measuring import Rows, parser
 
-from deal_hw.robots.registry import parameter_spaces, robot_description, training_task
+from deal_hw.robots.registry import default_space, robot_description, training_task
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.engine.model import load_model
 from deal_hw.workflows.robot import described
@@ -38,7 +38,7 @@ def measure(task: str, engine: Any, worlds: int, steps: int, repeats: int) -> di
     """Return one row."""
     description = robot_description(task)
     model = load_model(description)
-    space = next(iter(parameter_spaces(task).values()))()
+    space = default_space(task)
     members = min(worlds, MOST_MEMBERS)
     windows = max(worlds // members, 1)
     batch = ServoBatch(model, space, members, engine=engine)

@@ -20,13 +20,13 @@ from deal_hw.bench.transfer_target import judged
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.demonstration import BatchPolicy
-from deal_hw.robots import parameter_spaces, training_task
+from deal_hw.robots import default_space, training_task
 from deal_hw.workflows.train import train_policy
 
 
 def in_range(task: str, range_ratio: float) -> ParameterDistribution:
     """Return the uniform distribution over a task's search range in DEAL's tables."""
-    space = next(iter(parameter_spaces(task).values()))()
+    space = default_space(task)
     return ParameterDistribution.uniform(paper_ranges(space, range_ratio), training_task(task).udr_latency_s)
 
 

@@ -40,7 +40,7 @@ class Recipe:
             its own scale; infinite for none. The default is that of a uniform distribution over the range.
         robust: Large residuals weigh less (Huber).
         iterations: Most derivatives. Each serves up to ``SECANTS`` more steps.
-        steps: Derivatives between two estimates of the residual scale.
+        derivatives: Derivatives between two estimates of the residual scale.
         converged: Relative decrease of the cost between two estimates below which the fit ends: held-out
             motion does not show it.
         reach: See :class:`deal_hw.calib.fit.solver.SolverSettings`.
@@ -52,7 +52,7 @@ class Recipe:
     prior_std: float = 0.289
     robust: bool = False
     iterations: int = 24
-    steps: int = 2
+    derivatives: int = 2
     converged: float = 2e-3
     reach: float = 30.0
     longest_lag_s: float = 1.0
@@ -169,7 +169,7 @@ def fit_output_error(
         before = weighed.cost(point)
         # The prior holds insensitive parameters. Autocorrelated residuals weigh too little for one more hold.
         solver = SolverSettings(
-            iterations=min(recipe.steps, left),
+            iterations=min(recipe.derivatives, left),
             converged=recipe.converged,
             reach=recipe.reach,
             secants=SECANTS,

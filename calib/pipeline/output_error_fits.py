@@ -72,12 +72,12 @@ neighbourhood."""
 FOLDS = 3
 """Number of folds over the motions; a single motion is split in time."""
 
-FOLD_STEPS = 2
+FOLD_DERIVATIVES = 2
 """Most derivatives of a fit without a law in a fold. It begins in the minimum of all recordings. On the real
 SO-101 its error in a fold was then within 7 % of that after up to 24, and the same candidate was chosen.
 After one it still knew what was left out (up to 10 % below), and another one was chosen."""
 
-HALF_STEPS = 2
+HALF_DERIVATIVES = 2
 """Most derivatives of the fit of each half, which begins in the minimum of all recordings."""
 
 
@@ -350,7 +350,7 @@ class OutputErrorFits(Fits):
     ) -> dict[str, Member]:
         """Return every candidate without a law from the data of a fold."""
         first, *windows = [
-            fit_output_error(train, *start, recipe, iterations=FOLD_STEPS) for start, recipe in starts
+            fit_output_error(train, *start, recipe, iterations=FOLD_DERIVATIVES) for start, recipe in starts
         ]
         searched = None
         if search is not None:
@@ -391,7 +391,7 @@ class OutputErrorFits(Fits):
             if only in (None, name):
                 theta, latency_s = found["long"]
                 latency_s = latency_s if recipe.latency else problem.first_latency_s
-                most = FOLD_STEPS if only is None else None
+                most = FOLD_DERIVATIVES if only is None else None
                 found[name] = fit_output_error(problem, theta, latency_s, recipe, iterations=most).member
         return found
 
@@ -404,7 +404,7 @@ class OutputErrorFits(Fits):
 
         before, values = problem.steps, len(problem.space) + 1
         # Derivatives by each value and the latency, each with its steps; central ones at the end.
-        members = HALF_STEPS * (values + 1 + SECANTS) + 2 * values
+        members = HALF_DERIVATIVES * (values + 1 + SECANTS) + 2 * values
         substeps = problem.episodes[0].step_s / problem.robot.step_s
         cost = float(members * fit.plain.device_periods * substeps)
         if not run.allows(HALVES, cost):
@@ -412,7 +412,9 @@ class OutputErrorFits(Fits):
         parts = map(problem.part, fold_masks(problem, 2))
         try:
             halves = [
-                fit_output_error(part, fit.theta, fit.latency_s, recipe, iterations=HALF_STEPS, central=True)
+                fit_output_error(
+                    part, fit.theta, fit.latency_s, recipe, iterations=HALF_DERIVATIVES, central=True
+                )
                 for part in parts
             ]
         except InsufficientDataError as err:

@@ -4,6 +4,7 @@ from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEn
 from deal_hw.robots.file_robot import has_hardware, no_driver
 from deal_hw.robots.registry import (
     balanced,
+    default_space,
     default_transport,
     driven_entry,
     driven_robots,
@@ -33,6 +34,7 @@ __all__ = [
     "TransportEntry",
     "WireEntry",
     "balanced",
+    "default_space",
     "default_transport",
     "driven_entry",
     "driven_robots",

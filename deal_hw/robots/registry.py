@@ -304,6 +304,11 @@ def parameter_spaces(name: str) -> Mapping[str, Callable[[], ParameterSpace]]:
     return robot_entry(name).parameter_spaces()
 
 
+def default_space(name: str) -> ParameterSpace:
+    """Return a robot's usual parameter set. Raises as :func:`parameter_spaces`."""
+    return next(iter(parameter_spaces(name).values()))()
+
+
 def default_transport(name: str) -> str:
     """Return the transport that usually reaches a robot.
 

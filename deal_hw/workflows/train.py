@@ -449,10 +449,12 @@ def udr_distribution(robot: str, task: str = "") -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot, or no such task.
     """
-    from deal_hw.robots import training_task
+    from deal_hw.robots import default_space, training_task
 
     found = training_task(robot, task)
-    return ParameterDistribution.uniform(_space(robot).with_ratio(found.udr_ratio), found.udr_latency_s)
+    return ParameterDistribution.uniform(
+        default_space(robot).with_ratio(found.udr_ratio), found.udr_latency_s
+    )
 
 
 def nominal_distribution(robot: str, task: str = "") -> ParameterDistribution:
@@ -465,9 +467,9 @@ def nominal_distribution(robot: str, task: str = "") -> ParameterDistribution:
     Raises:
         UnknownNameError: There is no such robot, or no such task.
     """
-    from deal_hw.robots import training_task
+    from deal_hw.robots import default_space, training_task
 
-    found, space = training_task(robot, task), _space(robot)
+    found, space = training_task(robot, task), default_space(robot)
     K = len(space)
     return ParameterDistribution(
         space=space, mean=space.nominal, covariance=np.zeros((K, K)), latency_s=found.udr_latency_s
@@ -489,12 +491,6 @@ def _with_verdict(path: Path) -> tuple[ParameterDistribution, str]:
     values = read_json(path, dict[str, Any], what, advice, error=ConfigurationError)
     with reading(path, what, advice, error=ConfigurationError):
         return ParameterDistribution.from_json(values), str(values.get("verdict", ""))
-
-
-def _space(robot: str) -> ParameterSpace:
-    from deal_hw.robots import parameter_spaces
-
-    return next(iter(parameter_spaces(robot).values()))()
 
 
 class _Stop:

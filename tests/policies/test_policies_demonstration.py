@@ -29,7 +29,7 @@ from deal_hw.policies.go2_env import walk_spec
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import Observation, PolicySpec
-from deal_hw.robots import parameter_spaces, robot_description, training_task
+from deal_hw.robots import default_space, robot_description, training_task
 from deal_hw.rotations import in_base_frame
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_vector
@@ -44,7 +44,7 @@ WALK = (0.4, 0.0, 0.0)
 
 
 def loaded(robot: str) -> tuple[RobotModel, ParameterSpace]:
-    space = next(iter(parameter_spaces(robot).values()))()
+    space = default_space(robot)
     return load_model(robot_description(robot)), space.with_ratio(2.0)
 
 

@@ -22,7 +22,7 @@ from deal_hw.policies.locomotion import LocomotionEnv, judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.run_env import RunEnv, RunTask, run_spec
 from deal_hw.policy import Observation, PolicySpec
-from deal_hw.robots import parameter_spaces, recorded_description, robot_description
+from deal_hw.robots import default_space, recorded_description, robot_description
 from deal_hw.types import FloatArray, JointCommand
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,7 +32,7 @@ NEVER = 10**9
 
 
 def udr(robot: str) -> ParameterDistribution:
-    space = next(iter(parameter_spaces(robot).values()))()
+    space = default_space(robot)
     return ParameterDistribution.uniform(space.with_ratio(5.0), (0.0, 0.02))
 
 

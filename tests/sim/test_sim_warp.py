@@ -19,7 +19,7 @@ from fakes.law_robots import robot as robot_of
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.robots.registry import parameter_spaces, robot_description, training_task
+from deal_hw.robots.registry import default_space, robot_description, training_task
 from deal_hw.sim.engine.batch import ServoBatch, make_engine
 from deal_hw.sim.engine.gpu import EngineName, gpu_problem
 from deal_hw.sim.engine.model import RobotModel, load_model
@@ -209,7 +209,7 @@ def test_shipped_models_agree(name: str) -> None:
     """One step from random states to 1e-4 of the step's change; a rollout to its statistics."""
     description = robot_description(name)
     model = load_model(description)
-    space = next(iter(parameter_spaces(name).values()))()
+    space = default_space(name)
     rng = np.random.default_rng(3)
     theta = space.sample(rng, 3)
     rest = np.array(description.default_position)[list(description.actuated_index)]
