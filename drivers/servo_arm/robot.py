@@ -9,11 +9,12 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
+from deal_hw.drivers.servo_arm.absence import AbsenceWatch
 from deal_hw.drivers.servo_arm.commands import CommandCodec, Registers, clipped
 from deal_hw.drivers.servo_arm.examination import ArmExamination, ArmInfo
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, ServoSample
-from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, ServoBus, Writes
-from deal_hw.drivers.servo_bus.polled_robot import MISSES, PolledRobot, status_of
+from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, ServoBus, SilentServosError, Writes
+from deal_hw.drivers.servo_bus.polled_robot import PolledRobot, status_of
 from deal_hw.drivers.servo_bus.samples import SampleGrid
 from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
@@ -107,8 +108,7 @@ class ServoArm(PolledRobot[ServoBus]):
         self._in_force: _Sent | None = None
         self._written: Registers | None = None
         self._begin_ns = self._clock.now_ns()
-        self._misses = self._turn = 0
-        self._absent = dict.fromkeys(self._ids, 0)
+        self._absence = AbsenceWatch(self._ids, self._begin_ns)
         self._newest: dict[int, ServoSample] = {}
         self._newest_ns = self._unsound = 0
         self._doubted = False
@@ -257,16 +257,19 @@ class ServoArm(PolledRobot[ServoBus]):
         """Return a sample of every servo, now.
 
         Raises:
-            TransportTimeoutError: The servos are silent.
+            TransportTimeoutError: The servos are silent, or one of them; then the message names it.
             FrameError: Their answers are corrupt.
         """
         address, size = self._family.block
+        self._absence.answered(self._clock.now_ns())
         failures, patient_ns = 0, self._clock.now_ns() + _PATIENCE_NS
         while True:
             try:
-                self._poller.asked_ns = self._bus.ask(self._ids, address, size)
+                self._poller.asked_ns = self._bus.ask(self._absence.order, address, size)
                 found = self._bus.take(end_ns)
-            except (TransportTimeoutError, FrameError):
+            except (SilentServosError, FrameError) as error:
+                if absent := self._absent(error):
+                    raise TransportTimeoutError(f"{self._where}: {absent}") from error
                 failures += 1
                 now_ns = self._clock.now_ns()
                 if now_ns >= end_ns or (failures >= _MOST_FAILURES and now_ns >= patient_ns):
@@ -275,15 +278,13 @@ class ServoArm(PolledRobot[ServoBus]):
             if found is None:
                 raise TransportTimeoutError(f"{self._where}: the servos do not answer in time")
             self._poller.answered()
+            self._absence.answered(self._clock.now_ns())
             return {i: self._family.sample(i, data) for i, data in found.items()}
 
     # States.
 
     def _whom(self) -> tuple[int, ...]:
-        if self._misses < MISSES:
-            return self._ids
-        self._turn = (self._turn + 1) % len(self._ids)
-        return (self._ids[self._turn],)
+        return self._absence.order
 
     def _request(self, servos: tuple[int, ...]) -> int:
         return self._bus.ask(servos, *self._family.block)
@@ -291,18 +292,18 @@ class ServoArm(PolledRobot[ServoBus]):
     def _take(self, deadline_ns: int) -> None:
         try:
             found = self._bus.take(deadline_ns)
-        except (TransportTimeoutError, FrameError):
-            self._miss()
+        except (SilentServosError, FrameError) as error:
+            self._asked = ()
+            if absent := self._absent(error):
+                self._latch(absent)
             return
         if found is None:
             return
         asked, self._asked = self._asked, ()
         self._poller.answered()
-        for i in asked:
-            self._absent[i] = 0
-        if not any(self._absent.values()):
-            self._misses = 0
+        self._absence.answered(self._clock.now_ns())
         if asked != self._ids:
+            # In the other order the times of the servos' turns are others.
             return
         samples = {i: self._family.sample(i, data) for i, data in found.items()}
         if self._sound(samples):
@@ -332,23 +333,21 @@ class ServoArm(PolledRobot[ServoBus]):
         self._doubted = False
         return True
 
-    def _miss(self) -> None:
-        asked, self._asked = self._asked, ()
-        if len(asked) > 1:
-            self._misses += 1
-            if self._misses == MISSES:
-                # Until each has answered alone, none is known to be present.
-                self._absent = dict.fromkeys(self._ids, 1)
-            return
-        self._absent[asked[0]] += 1
-        # While none answers, it is the cable or the supply of all, and states grow old.
-        others = [i for i in self._ids if i != asked[0]]
-        if self._absent[asked[0]] > MISSES and (not others or any(not self._absent[i] for i in others)):
-            joint = next(servo.joint for servo in self._servos if servo.id == asked[0])
-            self._latch(
-                f"servo {asked[0]} ({joint}) stopped answering: it restarted, or lost its supply or its "
-                "cable. Check both, then start again"
-            )
+    def _absent(self, error: SilentServosError | FrameError) -> str:
+        """Return which servo is absent after a failed request, and what to do; "" while it is not known.
+
+        While none answers, it is the cable or the supply of all, and states grow old.
+        """
+        if not isinstance(error, SilentServosError):
+            return ""
+        absent = self._absence.missed(error.answered, self._clock.now_ns())
+        if absent is None:
+            return ""
+        joint = next(servo.joint for servo in self._servos if servo.id == absent)
+        return (
+            f"servo {absent} ({joint}) stopped answering: it restarted, or lost its supply or its cable. "
+            "Check both, then start again"
+        )
 
     def _receive(self, samples: Mapping[int, ServoSample]) -> None:
         self._judge(samples)

@@ -13,7 +13,14 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from deal_hw.clock import Clock
-from deal_hw.drivers.servo_bus.interface import Answer, Port, ServoBus, WantedAnswer, Writes
+from deal_hw.drivers.servo_bus.interface import (
+    Answer,
+    Port,
+    ServoBus,
+    SilentServosError,
+    WantedAnswer,
+    Writes,
+)
 from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.drivers.servo_bus.sdk import COMM_SUCCESS, PacketHandler, Protocol2PacketHandler
 from deal_hw.errors import DealHwError, FrameError, ProtocolError, TransportTimeoutError
@@ -217,9 +224,20 @@ class Bus(ServoBus):
             raise FrameError(f"the answer of servos {wanted.ids} is corrupt") from error
 
     def _incomplete(self, wanted: WantedAnswer) -> DealHwError:
-        if self._port.buffer:
-            return FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
-        return TransportTimeoutError(f"servos {wanted.ids} do not answer")
+        corrupt = FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
+        if wanted.fast and self._port.buffer:
+            return corrupt
+        answered = []
+        self._port.expire()
+        while self._port.buffer:
+            try:
+                packet, result = self._sdk.rxPacket(self._port, False)
+            except IndexError:
+                return corrupt
+            if result != COMM_SUCCESS or packet[4] not in wanted.ids:
+                return corrupt
+            answered.append(packet[4])
+        return SilentServosError([i for i in wanted.ids if i not in answered], answered)
 
     def _whole(self, answer: WantedAnswer) -> bool:
         """Return whether the buffer contains all requested packets; the SDK checks their content."""

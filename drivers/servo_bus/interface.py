@@ -41,6 +41,23 @@ class WantedAnswer(NamedTuple):
     until_ns: int
 
 
+class SilentServosError(TransportTimeoutError):
+    """Servos of a group did not answer, and no corrupt bytes came.
+
+    Attributes:
+        answered: The ids of those that did.
+
+    Args:
+        silent: The ids of those that did not.
+        answered: The ids of those that did.
+    """
+
+    def __init__(self, silent: Sequence[int], answered: Sequence[int]) -> None:
+        self.answered = tuple(answered)
+        others = f"; servos {self.answered} did" if self.answered else ""
+        super().__init__(f"servos {tuple(silent)} do not answer{others}")
+
+
 class Port:
     """Sends and receives the bytes of a bus.
 
@@ -215,7 +232,7 @@ class ServoBus(abc.ABC):
             None if no complete answer arrived until the deadline, but may still arrive.
 
         Raises:
-            TransportTimeoutError: The servos are silent.
+            SilentServosError: Some or all servos are silent.
             FrameError: The answer is corrupt.
         """
         wanted = self._wanted[0]
@@ -267,7 +284,7 @@ class ServoBus(abc.ABC):
 
         Raises:
             FrameError: It is corrupt.
-            TransportTimeoutError: It will not become complete.
+            SilentServosError: It will not become complete.
         """
 
     @abc.abstractmethod

@@ -26,7 +26,14 @@ from deal_hw.drivers.servo_bus.feetech.packets import (
     encode,
 )
 from deal_hw.drivers.servo_bus.feetech.registers import FIRMWARE_MAJOR, ID, MODEL_NUMBER
-from deal_hw.drivers.servo_bus.interface import Answer, Port, ServoBus, WantedAnswer, Writes
+from deal_hw.drivers.servo_bus.interface import (
+    Answer,
+    Port,
+    ServoBus,
+    SilentServosError,
+    WantedAnswer,
+    Writes,
+)
 from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.errors import DealHwError, FrameError, ProtocolError, TransportTimeoutError
 from deal_hw.transport import Transport
@@ -262,7 +269,7 @@ class FeetechBus(ServoBus):
         others = tuple(servo for servo in wanted.ids if servo in self._found)
         corrupt = self._parser.skipped > self._skipped
         self._begin_group()
-        beside = f"; servos {others} did" if others else ""
         if corrupt:
+            beside = f"; servos {others} did" if others else ""
             return FrameError(f"servos {missing} did not answer soundly, there were corrupt bytes{beside}")
-        return TransportTimeoutError(f"servos {missing} do not answer{beside}")
+        return SilentServosError(missing, others)
