@@ -183,6 +183,8 @@ class Dynamixel(Family):
         at = r.PRESENT_PWM.address - r.BLOCK_ADDRESS
         (pwm,) = struct.unpack_from("<h", data, at)
         fault = r.explain_hardware_error(block.hardware_error) if block.hardware_error else ""
+        if fault and not block.torque_enable:
+            fault += f"; {r.UNTIL_RESTARTED}"
         return ServoSample(
             ticks=block.present_position,
             ticks_s=block.present_velocity * r.RAD_S_PER_COUNT * r.PULSES / (2 * math.pi),

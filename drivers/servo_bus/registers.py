@@ -125,12 +125,16 @@ BAUD_RATES: Final = (9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000
 
 HARDWARE_ERRORS: Final = {
     0: ("input voltage out of its limits", "check the supply under load; XL330: 3.7 to 6.0 V"),
-    2: ("overheated", "let it cool, then look for friction, a jammed belt or too high a load"),
+    2: ("overheated", "let it cool, then look for friction, a jam or too high a load"),
     3: ("motor encoder fault", "switch it off and on; if the error returns, the servo is broken"),
     4: ("electrical shock, or too little power for the motor", "check supply and wires"),
-    5: ("overload", "look for a jammed cart or belt; lower the effort limit"),
+    5: ("overload", "look for a jam or too high a load; lower the effort limit"),
 }
 """Bits of Hardware Error Status: meaning and remedy of each (e-Manual)."""
+UNTIL_RESTARTED: Final = (
+    "it gives no torque until it is switched off and on, or restarted with Dynamixel Wizard"
+)
+"""What follows from an error that is one of Shutdown's."""
 
 
 def explain_hardware_error(value: int) -> str:

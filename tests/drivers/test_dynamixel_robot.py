@@ -338,7 +338,7 @@ def test_an_overload_is_named_with_its_remedy() -> None:
     states = wire.run(1)
     assert Status.ARMED not in states[-1].status
     assert Status.FAULT in states[-1].status
-    assert "servo 1 reports: overload (look for a jammed cart or belt" in robot.fault
+    assert "servo 1 reports: overload (look for a jam or too high a load" in robot.fault
     robot.passive()
     with pytest.raises(SafetyError, match="overload"):
         robot.home(20.0)

@@ -20,6 +20,7 @@ from deal_hw.drivers.servo_bus.polled_robot import MISSES, PolledRobot, status_o
 from deal_hw.drivers.servo_bus.registers import (
     PROFILE_ONGOING,
     RAD_S_PER_COUNT,
+    UNTIL_RESTARTED,
     WATCHDOG_TRIPPED,
     Block,
     explain_hardware_error,
@@ -35,10 +36,7 @@ _AT_STOP_M = 0.001
 
 
 def _hardware_error(servo: int, block: Block) -> str:
-    return (
-        f"servo {servo} reports: {explain_hardware_error(block.hardware_error)}; it gives no torque until it "
-        "is switched off and on, or restarted with Dynamixel Wizard"
-    )
+    return f"servo {servo} reports: {explain_hardware_error(block.hardware_error)}; {UNTIL_RESTARTED}"
 
 
 class _Sent(NamedTuple):

@@ -75,7 +75,8 @@ FAULTS: Final = {
     Fault.CURRENT: ("current too high", "look for a jam or a short; lower the torque limit"),
     Fault.OVERLOAD: (
         "overload: it holds with reduced torque",
-        "take the load off; look for a jam, then write a new goal",
+        "take the load off and look for a jam; if the next start still reports it, switch the servo's supply "
+        "off and on",
     ),
 }
 """Meaning and remedy of each fault."""
