@@ -13,6 +13,7 @@ from deal_hw.clock import VirtualClock
 from deal_hw.drivers.servo_arm.device import ArmDevice
 from deal_hw.drivers.servo_arm.emulator import arm_device
 from deal_hw.drivers.servo_arm.families import FAMILIES
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.drivers.servo_arm.robot import ServoArm
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import TransportTimeoutError
@@ -82,6 +83,7 @@ class Rig:
         bus: str,
         wrap: Callable[[Transport], Transport] = lambda transport: transport,
         device_file: RobotFile | None = None,
+        faults: ArmFaults | None = None,
         **section: Any,
     ) -> None:
         self.file = arm_file(folder, bus, **section)
@@ -95,7 +97,9 @@ class Rig:
         truth = SimulatedTruth(parameters=values, latency_s=0.0, seed=0)
         hardware = (device_file or self.file).servo_bus
         assert hardware is not None
-        self.device: ArmDevice = arm_device(hardware, self.description, space, truth, noisy=False)
+        self.device: ArmDevice = arm_device(
+            hardware, self.description, space, truth, faults=faults, noisy=False
+        )
         self.virtual = VirtualTransport(self.device, self.clock)
         self.robot = ServoArm(
             wrap(self.virtual), self.clock, self.description, self.file.servo_bus, FAMILIES[bus]()

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.testing.faults import FaultRates, FrameFaults
 from deal_hw.testing.pseudo_terminal import PortFaults, PseudoTerminal, SteppedDevice
 
@@ -33,6 +34,7 @@ class EmulatorRequest:
         link: A symbolic link to make to the pseudo-terminal; None for none.
         vanish_after_s: The pseudo-terminal vanishes this long after the first command; None: never [s].
         return_after_s: It comes back under the link this long after that; None: it does not [s].
+        servos: Faults of the servos of an arm.
     """
 
     wire: str
@@ -49,6 +51,7 @@ class EmulatorRequest:
     link: Path | None = None
     vanish_after_s: float | None = None
     return_after_s: float | None = None
+    servos: ArmFaults = field(default_factory=ArmFaults)
 
 
 class Emulation(Protocol):

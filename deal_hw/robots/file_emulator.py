@@ -32,14 +32,15 @@ def emulate_arm(file: RobotFile, description: RobotDescription, request: Emulato
     space = default_space(description)
     truth = truth_of(space, request)
     noisy = request.profile != "ideal"
-    device = arm_device(section_of(file), description, space, truth, noisy=noisy)
+    section = section_of(file)
+    device = arm_device(section, description, space, truth, faults=request.servos, noisy=noisy)
     return on_pseudo_terminal(device, request, truth.to_json())
 
 
 def emulate_so101(request: EmulatorRequest) -> Emulation:
     """Return an emulated SO-101 behind a pseudo-terminal; its servos keep LeRobot's calibration."""
     truth = truth_of(emulated_space(), request)
-    device = so101_device(truth, noisy=request.profile != "ideal")
+    device = so101_device(truth, faults=request.servos, noisy=request.profile != "ideal")
     return on_pseudo_terminal(device, request, truth.to_json())
 
 

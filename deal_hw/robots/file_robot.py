@@ -51,6 +51,14 @@ def has_hardware(robot: str) -> bool:
         return False
 
 
+def has_servos(robot: str) -> bool:
+    """Return whether a robot.yaml names a bus of servos; False for one that cannot be read."""
+    try:
+        return _read(robot_yaml(robot)).servo_bus is not None
+    except DealHwError:
+        return False
+
+
 def file_entry(robot: str) -> RobotEntry:
     """Return the entry of a robot of a user.
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel
@@ -45,7 +47,11 @@ class ArmDevice:
         truth: Hidden values.
         joints: The emulated servos, in the order of the joints.
         bus: Their bus.
+        faults: Faults of one servo.
         noisy: Whether positions have the noise of the robot's description.
+
+    Raises:
+        ConfigurationError: No servo has the id of the faulty one.
     """
 
     def __init__(
@@ -57,6 +63,7 @@ class ArmDevice:
         joints: Sequence[EmulatedJoint],
         bus: ServosSide[Any],
         *,
+        faults: ArmFaults | None = None,
         noisy: bool = True,
     ) -> None:
         self.joints, self.bus, self.received_bytes = tuple(joints), bus, 0
@@ -70,6 +77,8 @@ class ArmDevice:
         self._effort = self._batch.batch.bind("qfrc_actuator")
         self._dofs = list(robot.qvel)
         self._of_id = {servo.id: j for j, servo in enumerate(self._servos)}
+        self._due = self._schedule(faults or ArmFaults())
+        self._first_ns: int | None = None
         limits = dict(zip(d.actuated, d.effort_limit, strict=True))
         # Without a limit nothing says what share of the voltage an effort takes.
         self._most = [
@@ -140,8 +149,9 @@ class ArmDevice:
 
     @property
     def trouble(self) -> str:
-        """Current fault; "" for none."""
-        return ""
+        """Current fault of a servo; "" for none."""
+        found = (joint.trouble(self._now_ns) for joint in self.joints)
+        return next((trouble for trouble in found if trouble), "")
 
     @property
     def frame_errors(self) -> int:
@@ -178,8 +188,34 @@ class ArmDevice:
         """Take the time [ns], after all ticks up to it."""
         self.bus.now_ns = self._now_ns = max(self._now_ns, device_ns)
 
+    def _schedule(self, faults: ArmFaults) -> list[tuple[float, Callable[[], None]]]:
+        """Return the faults in the order of their times after the first torque [s]."""
+        servo = self._servos[-1].id if faults.faulty_servo is None else faults.faulty_servo
+        if servo not in self._of_id:
+            raise ConfigurationError(
+                f"--faulty-servo {servo}: no servo has this id; the robot has {sorted(self._of_id)}"
+            )
+        joint = self.joints[self._of_id[servo]]
+        acts: list[tuple[float | None, Callable[[], None]]] = [
+            (faults.servo_absent_after_s, lambda: joint.unplug(self._now_ns)),
+            (faults.servo_reboot_after_s, lambda: joint.restart(self._now_ns)),
+            (faults.servo_overload_after_s, joint.overload),
+        ]
+        return sorted(((at_s, act) for at_s, act in acts if at_s is not None), key=lambda due: due[0])
+
+    def _fail(self) -> None:
+        """Apply the faults that are due."""
+        if self._first_ns is None and self.armed:
+            self._first_ns = self._now_ns
+        while self._first_ns is not None and self._due:
+            if self._now_ns - self._first_ns < round(self._due[0][0] * 1e9):
+                return
+            self._due.pop(0)[1]()
+
     def _step(self) -> None:
         now_ns = self._tick * self._tick_ns
+        if self._due:
+            self._fail()
         for joint in self.joints:
             joint.tick(now_ns, now_ns - self.bus.alive_ns)
         while self._coming and self._coming[0][0] <= self._tick:

@@ -10,16 +10,21 @@ from deal_hw.drivers.servo_arm.families import OFF, ON, Dynamixel, Feetech, Loop
 from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus import xl330
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
-from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
+from deal_hw.drivers.servo_bus.emulated_servo import OVERLOAD_ERROR, EmulatedServo
 from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
 from deal_hw.drivers.servo_bus.feetech.emulated_servo import StsServo
+from deal_hw.drivers.servo_bus.feetech.packets import Fault
 from deal_hw.drivers.servo_bus.registers import OperatingMode
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.sim.robots.hardware_section import ServoEntry
 
 _COUNTS_S: Final = 60 / (0.229 * r.PULSES)
 """Units of a velocity register in a tick a second."""
+
+
+ABSENT, RESTARTS, OVERLOAD = TROUBLES = ("servo absent", "servo restarts", "overload")
+"""Faults of a servo, in words."""
 
 
 class EmulatedJoint(abc.ABC):
@@ -67,6 +72,22 @@ class EmulatedJoint(abc.ABC):
     @abc.abstractmethod
     def tick(self, now_ns: int, silence_ns: int) -> None:
         """Advance its clock."""
+
+    @abc.abstractmethod
+    def trouble(self, now_ns: int) -> str:
+        """Return its fault at a time [ns], one of :data:`TROUBLES`; "" for none."""
+
+    @abc.abstractmethod
+    def restart(self, now_ns: int) -> None:
+        """Restart at a time [ns], as after a dip of its supply."""
+
+    @abc.abstractmethod
+    def unplug(self, now_ns: int) -> None:
+        """Take its supply and its data away at a time [ns]."""
+
+    @abc.abstractmethod
+    def overload(self) -> None:
+        """Report an overload whose cause stays."""
 
 
 class DynamixelJoint(EmulatedJoint):
@@ -120,6 +141,23 @@ class DynamixelJoint(EmulatedJoint):
         """Advance its clock and its watchdog."""
         self.servo.tick(now_ns, silence_ns)
 
+    def trouble(self, now_ns: int) -> str:
+        """Return its fault at a time [ns]."""
+        return _trouble(self.servo, now_ns, self.servo.get(r.HARDWARE_ERROR) & OVERLOAD_ERROR)
+
+    def restart(self, now_ns: int) -> None:
+        """Restart at a time [ns]."""
+        self.servo.reboot(now_ns)
+
+    def unplug(self, now_ns: int) -> None:
+        """Take its supply and its data away at a time [ns]."""
+        self.servo.reboot(now_ns)
+        self.servo.present = False
+
+    def overload(self) -> None:
+        """Report an overload; it gives no torque until it restarts."""
+        self.servo.fail(OVERLOAD_ERROR)
+
 
 class StsJoint(EmulatedJoint):
     """An emulated STS servo, with the homing offset 0.
@@ -164,6 +202,31 @@ class StsJoint(EmulatedJoint):
 
     def tick(self, now_ns: int, silence_ns: int) -> None:
         """Do nothing: the bus advances its protections, and there is no watchdog."""
+
+    def trouble(self, now_ns: int) -> str:
+        """Return its fault at a time [ns]."""
+        return _trouble(self.servo, now_ns, self.servo.error & Fault.OVERLOAD)
+
+    def restart(self, now_ns: int) -> None:
+        """Restart at a time [ns]."""
+        self.servo.reboot(now_ns)
+
+    def unplug(self, now_ns: int) -> None:
+        """Take its supply and its data away at a time [ns]."""
+        self.servo.reboot(now_ns)
+        self.servo.present = False
+
+    def overload(self) -> None:
+        """Report an overload; it holds with Protective Torque until it restarts."""
+        self.servo.fail(Fault.OVERLOAD, lasting=True)
+
+
+def _trouble(servo: EmulatedServo | StsServo, now_ns: int, overload: int) -> str:
+    if not servo.present:
+        return ABSENT
+    if not servo.awake(now_ns):
+        return RESTARTS
+    return OVERLOAD if overload else ""
 
 
 EmulatedArm: TypeAlias = tuple[Sequence[EmulatedJoint], ServosSide[Any]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.device import ArmDevice
 from deal_hw.drivers.servo_arm.emulated_families import EMULATED
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.robots.hardware_section import HardwareSection
@@ -17,6 +18,7 @@ def arm_device(
     space: ParameterSpace,
     truth: SimulatedTruth,
     *,
+    faults: ArmFaults | None = None,
     noisy: bool = True,
 ) -> ArmDevice:
     """Return an emulated arm.
@@ -26,9 +28,11 @@ def arm_device(
         description: The robot.
         space: The parameters of the truth.
         truth: Their hidden values.
+        faults: Faults of one servo.
         noisy: Whether positions have the noise of the description.
     """
     by_joint = {servo.joint: servo for servo in hardware.servos}
     servos = [by_joint[name] for name in description.joint_names]
     joints, bus = EMULATED[hardware.bus](servos, hardware.baud_rate)
-    return ArmDevice(hardware, load_model(description), space, truth, joints, bus, noisy=noisy)
+    robot = load_model(description)
+    return ArmDevice(hardware, robot, space, truth, joints, bus, faults=faults, noisy=noisy)

@@ -29,6 +29,8 @@ KEEP_ID, KEEP_ID_AND_BAUD, RESET_ALL = 1, 2, 0xFF
 _ONE_TURN_OFFSET: Final = 1024
 """A larger homing offset is ignored in position control mode (e-Manual, Homing Offset)."""
 _VOLTAGE_ERROR: Final = 1
+OVERLOAD_ERROR: Final = 1 << 5
+"""Bit of Hardware Error Status."""
 _INDIRECT = range(r.INDIRECT_DATA.address, r.INDIRECT_DATA.address + r.INDIRECT_COUNT)
 
 
@@ -59,7 +61,7 @@ class EmulatedServo:
         self.present, self.protocol = True, 2
         self._table = bytearray(xl330.TABLE_BYTES)
         self._registered: tuple[int, bytes] | None = None
-        self._start_ns = self._silent_until_ns = 0
+        self._start_ns = self._silent_until_ns = self._heard_ns = 0
         self._shaft = self._base = 0
         for register, value in (
             *xl330.EEPROM.items(),
@@ -201,11 +203,19 @@ class EmulatedServo:
             self.put(r.TORQUE_ENABLE, 0)
 
     def tick(self, now_ns: int, silence_ns: int) -> None:
-        """Advance by a millisecond; ``silence_ns`` is the time without a packet [ns]."""
+        """Advance its clock, its protections and its watchdog.
+
+        Args:
+            now_ns: Present time [ns].
+            silence_ns: Time without a packet on the bus [ns]; an absent or starting servo receives none.
+        """
+        if self.awake(now_ns):
+            self._heard_ns = now_ns - silence_ns
         self.put(r.REALTIME_TICK, max(0, now_ns - self._start_ns) // 1_000_000 % TICK_PERIOD_MS)
         if not self.get(r.MIN_VOLTAGE_LIMIT) <= xl330.VOLTAGE <= self.get(r.MAX_VOLTAGE_LIMIT):
             self.fail(_VOLTAGE_ERROR)
         limit = self.get(r.BUS_WATCHDOG)
+        silence_ns = now_ns - self._heard_ns
         if self.get(r.TORQUE_ENABLE) and limit > 0 and silence_ns > limit * WATCHDOG_UNIT_S * 1e9:
             self.put(r.BUS_WATCHDOG, WATCHDOG_TRIPPED)
 

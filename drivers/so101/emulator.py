@@ -8,6 +8,7 @@ from typing import Final
 from deal_hw.drivers.servo_arm.calibrated import WHOLE_TURN
 from deal_hw.drivers.servo_arm.device import ArmDevice
 from deal_hw.drivers.servo_arm.emulator import arm_device
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.so101.description import DRIVEN, emulated_space
 from deal_hw.drivers.so101.robot import HARDWARE, RANGES, UNSWEPT
@@ -18,17 +19,18 @@ HOMED: Final = 2047
 """What LeRobot's homing makes of the middle of a joint's travel [ticks]."""
 
 
-def so101_device(truth: SimulatedTruth, *, noisy: bool = True) -> ArmDevice:
+def so101_device(truth: SimulatedTruth, *, faults: ArmFaults | None = None, noisy: bool = True) -> ArmDevice:
     """Return an emulated arm, whose servos keep the ends of their travels as LeRobot writes them.
 
     A joint's encoder bias is that its middle was not found exactly: the servo's limits are off by it.
 
     Args:
         truth: Values of the parameters of :func:`~deal_hw.drivers.so101.description.emulated_space`.
+        faults: Faults of one servo.
         noisy: Whether positions have the noise of the description.
     """
     hardware = homed()
-    device = arm_device(hardware, DRIVEN, emulated_space(), truth, noisy=noisy)
+    device = arm_device(hardware, DRIVEN, emulated_space(), truth, faults=faults, noisy=noisy)
     for servo, emulated in zip(hardware.servos, device.bus.servos, strict=True):
         low, high = limits_of(servo)
         emulated.keep(f.MIN_POSITION, low)

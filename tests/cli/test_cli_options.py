@@ -73,6 +73,7 @@ FINE_AT_ZERO = {
     "servo_reboot_after_s",
     "servo_overload_after_s",
     "servo_absent_after_s",
+    "faulty_servo",
     "truth_seed",
     "truth_latency",
 }

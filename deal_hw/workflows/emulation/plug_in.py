@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.robots import robot_entry
 from deal_hw.robots.connect import reached_over
 from deal_hw.robots.emulation import Emulation, EmulatorRequest
 from deal_hw.testing.faults import FaultRates
 from deal_hw.workflows.emulation.common import read_truth, serve
-from deal_hw.workflows.emulation.settings import EmulatePlugInSettings
+from deal_hw.workflows.emulation.settings import EmulateArmSettings, EmulatePlugInSettings
 from deal_hw.workflows.say import Say
 
 
@@ -57,4 +58,5 @@ def request_of(config: EmulatePlugInSettings, wire: str) -> EmulatorRequest:
         link=None if config.link is None else Path(config.link),
         vanish_after_s=config.vanish_after_s,
         return_after_s=config.return_after_s,
+        servos=config.servos if isinstance(config, EmulateArmSettings) else ArmFaults(),
     )

@@ -9,10 +9,11 @@ from typing import Annotated, Literal
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.g1.emulator.faults import G1Faults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
+from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
 from deal_hw.robots import driven_entry, emulated_robots, has_hardware, robot_entry
-from deal_hw.robots.file_robot import robot_yaml
+from deal_hw.robots.file_robot import has_servos, robot_yaml
 from deal_hw.transport import NetworkOptions, WireOptions
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Share, given, refuse
@@ -235,6 +236,19 @@ class EmulatePlugInSettings(PseudoTerminalSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class EmulateArmSettings(EmulatePlugInSettings):
+    """Emulate an arm of servos in real time on its own port, with hidden physics."""
+
+    servos: ArmFaults = field(default_factory=ArmFaults)
+    """Faults of its servos."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if is_user_robot(self.robot) and not has_servos(self.robot):
+            refuse(given(self.servos, ArmFaults()), "only a robot whose `hardware` has a bus has servos")
+
+
+@dataclass(frozen=True, kw_only=True)
 class EmulateGo2Settings(EmulateSettings):
     """Emulate a Go2 in real time on its own network, with hidden physics."""
 
@@ -295,6 +309,7 @@ _SETTINGS: dict[str, type[EmulateSettings]] = {
     "go2": EmulateGo2Settings,
     "g1": EmulateG1Settings,
     "g1_23dof": EmulateG1Settings,
+    "so101": EmulateArmSettings,
 }
 
 
@@ -311,7 +326,7 @@ def _table() -> dict[str, InputKind]:
         for name in emulated_robots()
     }
     what = "Emulate the robot of a robot.yaml: its bytes on a port of its own, with hidden physics."
-    return {**found, FILE: InputKind(EmulatePlugInSettings, what, example=f"{FILE} --seed 0")}
+    return {**found, FILE: InputKind(EmulateArmSettings, what, example=f"{FILE} --seed 0")}
 
 
 def _find(arguments: Arguments) -> str:

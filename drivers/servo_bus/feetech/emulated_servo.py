@@ -239,12 +239,17 @@ class StsServo:
             latched |= Fault.CURRENT
         self._report(latched)
 
-    def fail(self, bits: int) -> None:
+    def fail(self, bits: int, *, lasting: bool = False) -> None:
         """Report faults; the torque goes off as Unloading Condition says.
 
-        Overload and current end as if the servo had found them, the others with Reset and a restart.
+        They end with Reset and a restart.
+
+        Args:
+            bits: The faults.
+            lasting: Whether that holds for overload and current, too; else they end as if the servo had found
+                them.
         """
-        self._forced |= bits & ~_LATCHED
+        self._forced |= bits if lasting else bits & ~_LATCHED
         self._report(self._latched | bits & _LATCHED)
 
     @property
