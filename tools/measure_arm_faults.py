@@ -8,26 +8,39 @@ python tools/measure_arm_faults.py --table faults.md arm_dynamixel.json arm_feet
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import os
+import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from arm_rig import BUSES, arm_file
-from fault_acts import LINK_S, after, freeze_link, kill_both, link_cases, process_cases
-from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
+from fault_acts import LINK_S, after, freeze_link, kill_both, link_cases, process_cases, signal_run
+from fault_rig import ANY, ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
 from fault_table import main
 
+from deal_hw.clock import MonotonicClock
+from deal_hw.drivers.servo_arm.emulated_families import TROUBLES
+from deal_hw.drivers.servo_arm.families import FAMILIES, OFF, Family
+from deal_hw.drivers.servo_bus.interface import ServoBus
+from deal_hw.drivers.transports.serial_transport import SerialTransport
+from deal_hw.errors import FrameError, TransportError
 from deal_hw.sim.robots.file_description import file_description
 from deal_hw.sim.robots.robot_file import write_robot_file
 
 SECONDS = 1.5
 ARMED, IDLE, BRAKING, PARTLY, STOPPED = "armed", "idle", "braking", "partly", "stopped"
-BY_ITSELF = ("gone", "cut", "frozen")
+BY_ITSELF = ("gone", "cut", "frozen", *TROUBLES)
 DYNAMIXEL, FEETECH = ("dynamixel",), ("feetech",)
 ARM = "two joints"
+SERVOS = (1, 2)
+BAUD_RATE = 1_000_000
+READING_S, READING_RATE_HZ = 3.0, 50.0
+"""How long another program reads all servos, and how often."""
 
 
 class ArmRig(Rig):
@@ -58,7 +71,9 @@ class ArmRig(Rig):
 
     def emulator_options(self) -> list[str]:
         """A port that keeps its name when the cable is put back."""
-        return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port")]
+        faults_of_servo = any(word.startswith("--servo") for word in self.case.emulator)
+        faulty = ["--faulty-servo", str(self.rng.choice(SERVOS))] if faults_of_servo else []
+        return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port"), *faulty]
 
     def arguments(self) -> list[str]:
         """Play a chirp."""
@@ -88,8 +103,41 @@ class ArmRig(Rig):
         return f"the motors got {given}" if given else ""
 
     def by_itself(self, report: Mapping[str, Any]) -> int:
-        """The port vanished, the wire was cut, or the servos hang."""
+        """The port vanished, the wire was cut, the servos hang, or one has a fault."""
         return next((ns for ns, what in self.changes(report) if what in BY_ITSELF), -1)
+
+
+@contextlib.contextmanager
+def other_program(rig: Rig) -> Iterator[tuple[Family, ServoBus]]:
+    """Open the port as a program does that does not respect its lock, such as one with a vendor's library."""
+    family = FAMILIES[rig.wire]()
+    descriptor = os.open(rig.port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    clock = MonotonicClock()
+    with SerialTransport.from_fd(descriptor, clock, rig.port, BAUD_RATE) as transport:
+        yield family, family.bus(transport, clock, BAUD_RATE, 0.008)
+
+
+def take_torque(rig: Rig) -> None:
+    """Another program begins as LeRobot's do: it switches the torque of a servo off."""
+    with other_program(rig) as (family, bus):
+        rig.fault()
+        bus.post(family.torque([int(rig.rng.choice(SERVOS))], OFF))
+
+
+def read_beside(rig: Rig) -> None:
+    """Another program reads all servos: requests collide, and each program takes answers of the other's."""
+    clock = MonotonicClock()
+    with other_program(rig) as (family, bus):
+        rig.fault()
+        due_ns = clock.now_ns()
+        for _ in range(round(READING_S * READING_RATE_HZ)):
+            if rig.run.poll() is not None:
+                return
+            with contextlib.suppress(TransportError, FrameError):
+                bus.ask(SERVOS, *family.block)
+                bus.take(clock.now_ns() + 10_000_000)
+            due_ns += round(1e9 / READING_RATE_HZ)
+            clock.sleep_until_ns(due_ns)
 
 
 _BOTH = "both processes are killed (SIGKILL); "
@@ -101,6 +149,7 @@ CASES = (
         for case in process_cases()
         if not case.dry and not case.policy
     ),
+    Case(name="the terminal is closed (SIGHUP)", act=signal_run(signal.SIGHUP), phases=ANY, codes=(130,)),
     Case(
         name=f"{_BOTH}the servos' watchdog stops them",
         act=kill_both,
@@ -128,6 +177,11 @@ CASES = (
         for seconds in LINK_S
     ),
     Case(name="60 % of the answers corrupt", emulator=("--corrupt", "0.6"), codes=(2, 3)),
+    Case(name="a servo restarts", emulator=after("--servo-reboot-after-s")),
+    Case(name="a servo reports overload", emulator=after("--servo-overload-after-s")),
+    Case(name="a servo is unplugged", emulator=after("--servo-absent-after-s")),
+    Case(name="another program switches a servo's torque off", act=take_torque, phases=(RUNNING,)),
+    Case(name="another program reads the servos", act=read_beside, phases=(RUNNING,), codes=(3, 0)),
 )
 TITLE = "Arm of servos: from a fault to motors without torque, or braking"
 WORDS = (

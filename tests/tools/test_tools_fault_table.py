@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fault_rig import RUNNING, Case, SpoiledError
-from fault_table import page
+from fault_rig import ENDING, RUNNING, Case, SpoiledError
+from fault_table import complaints, page
+from measure_arm_faults import ARMED, IDLE, ArmRig
 from measure_go2_faults import Go2Rig
 
 pytestmark = pytest.mark.real_time
@@ -58,3 +60,23 @@ def test_a_run_that_never_reaches_its_phase_is_no_repetition(
     monkeypatch.setattr(rig, "until", until)
     with pytest.raises(SpoiledError, match="did not reach its phase 'running': waited 40 s"):
         rig.await_moment()
+
+
+@pytest.mark.parametrize(
+    ("phase", "fault_ns", "fine"),
+    [
+        # The motors were idle before the fault: the run had ended, and its exit code stays.
+        (ENDING, 250, True),
+        # They obeyed: a run whose control process stood still must not end as finished.
+        (ENDING, 150, False),
+        (RUNNING, 250, False),
+    ],
+)
+def test_a_fault_after_the_end_leaves_the_exit_code(
+    tmp_path: Path, phase: str, fault_ns: int, fine: bool
+) -> None:
+    """By the emulator's log, not by the run's own report."""
+    rig = ArmRig(Case(name="x", codes=(2,)), "dynamixel", tmp_path, np.random.default_rng(0))
+    rig.phase, rig.fault_ns, rig.run = phase, fault_ns, argparse.Namespace(returncode=0)  # type: ignore[assignment]
+    report = {"changes": [[0, 100, ARMED], [0, 200, IDLE]]}
+    assert complaints(rig, report, {"dataset": "whole"}) == ([] if fine else ["exit code 0"])
