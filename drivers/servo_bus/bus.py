@@ -237,7 +237,8 @@ class Bus(ServoBus):
             if result != COMM_SUCCESS or packet[4] not in wanted.ids:
                 return corrupt
             answered.append(packet[4])
-        return SilentServosError([i for i in wanted.ids if i not in answered], answered)
+        silent = [servo for servo in wanted.ids if servo not in answered]
+        return SilentServosError(silent, answered) if silent else corrupt
 
     def _whole(self, answer: WantedAnswer) -> bool:
         """Return whether the buffer contains all requested packets; the SDK checks their content."""

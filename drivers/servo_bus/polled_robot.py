@@ -134,7 +134,7 @@ class PolledRobot(Robot, Generic[BusT]):
 
     @abc.abstractmethod
     def _whom(self) -> tuple[int, ...]:
-        """Return the servos to ask next: all, or one of them while it is not known which is absent."""
+        """Return the servos to ask next: all in some order, or one while an absent one is searched."""
 
     @abc.abstractmethod
     def _request(self, servos: tuple[int, ...]) -> int:

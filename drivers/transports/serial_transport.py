@@ -119,7 +119,7 @@ class SerialTransport(Transport):
         if written < len(message.payload):
             raise TransportTimeoutError(
                 f"{self.port}: took {written} of {len(message.payload)} bytes; "
-                "the device does not read its input"
+                "the device does not read its input, or another program writes to the port"
             )
 
     def receive(self, timeout_s: float) -> Message:
