@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import tyro
 from measuring import Rows, spread
@@ -41,7 +41,7 @@ MIDDLE = 2048
 class Arm(NamedTuple):
     """A row: bus, number of joints, baud rate."""
 
-    bus: str
+    bus: Literal["feetech", "dynamixel"]
     joints: int
     baud_rate: int
 
