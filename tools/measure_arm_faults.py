@@ -202,8 +202,9 @@ WORDS = (
     "`tools/measure_arm_faults.py` measured it on an emulated arm of two joints, profile `sensor`, over a",
     "pseudo-terminal: Dynamixel servos, whose passive state is no torque, and Feetech servos, which brake.",
     "Each repetition draws a random moment of a random phase (connecting, moving to the start pose, arming,",
-    "running, ending). Feetech servos have no watchdog: where both processes are killed, they hold their",
-    "last goal.",
+    "running, ending). A fault that comes after a run has made the motors passive leaves its exit code 0.",
+    "Feetech servos have no watchdog: where both processes are killed, they hold their last goal. Which",
+    "servo fails is drawn, too; an unplugged one has no supply. An empty cell was not measured.",
     "",
 )
 
