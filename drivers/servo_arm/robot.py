@@ -346,7 +346,7 @@ class ServoArm(PolledRobot[ServoBus]):
         joint = next(servo.joint for servo in self._servos if servo.id == absent)
         return (
             f"servo {absent} ({joint}) stopped answering: it restarted, or lost its supply or its cable. "
-            "Check both, then start again"
+            "Check both, end other programs on the bus, then start again"
         )
 
     def _receive(self, samples: Mapping[int, ServoSample]) -> None:

@@ -27,7 +27,10 @@ from deal_hw.workflows.emulation.settings import EmulateArmSettings
 
 PASSIVE = {"dynamixel": OFF, "feetech": DAMPING}
 NAMES = {1: "servo 1 (shoulder)", 2: "servo 2 (elbow)"}
-SILENT = "stopped answering: it restarted, or lost its supply or its cable. Check both, then start again"
+SILENT = (
+    "stopped answering: it restarted, or lost its supply or its cable. Check both, end other programs on the "
+    "bus, then start again"
+)
 PERIOD_NS = 20_000_000
 
 
