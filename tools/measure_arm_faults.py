@@ -39,6 +39,7 @@ DYNAMIXEL, FEETECH = ("dynamixel",), ("feetech",)
 ARM = "two joints"
 SERVOS = (1, 2)
 BAUD_RATE = 1_000_000
+STATE_AGE_MS = 100.0
 READING_S, READING_RATE_HZ = 3.0, 50.0
 """How long another program reads all servos, and how often."""
 
@@ -171,7 +172,11 @@ CASES = (
         phases=(RUNNING,),
         wires=FEETECH,
     ),
-    *link_cases({"the cable is cut for {}": freeze_link}, cut=True),
+    *(
+        # A cut of 0.1 s is as long as the oldest state that does not trip a run: some runs go on.
+        dataclasses.replace(case, codes=(0, 3)) if case.from_ms <= STATE_AGE_MS else case
+        for case in link_cases({"the cable is cut for {}": freeze_link}, cut=True)
+    ),
     *(
         Case(
             name=f"the cable is pulled, and put back after {seconds:g} s",
