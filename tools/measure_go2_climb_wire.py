@@ -1,0 +1,89 @@
+"""Let an emulated Go2 climb over its wire, in real time: the whole of `deal-hw deploy`, DDS and Zenoh.
+
+    python tools/measure_go2_climb_wire.py --policy climb --height 0.1 --seeds 1000-1004 --out climb_wire.json
+
+The emulator is a process of its own, with hidden gains, friction, payload and latency, and with a platform
+1 m ahead. `deal-hw deploy` stands the robot up, walks it ahead at 0.6 m/s for 6 s, and lays it down. A try
+succeeds if the run ends as planned with the base at least 0.5 m beyond the edge; the emulator's own track
+says where it is. A row is one robot and wire. Ends are those of the run: `finished`, or what tripped.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from measuring import Row, Rows, add_seeds, parser
+
+from deal_hw.workflows.emulation.go2 import read_track
+from deal_hw.workflows.emulation.process import EmulatorProcess
+
+PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
+EDGE_M, BEYOND_M = 1.0, 0.5
+SECONDS, AHEAD_M_S = 6.0, 0.6
+LONGEST_S = 120.0
+
+
+def measure(policy: str, wire: str, height: float, seed: int, *, blind: bool) -> Row:
+    """Return the row of one try.
+
+    Args:
+        policy: A policy's file, or its name.
+        wire: ``dds`` or ``zenoh``.
+        height: Of the platform [m].
+        seed: Of the hidden robot.
+        blind: Whether the robot is told nothing.
+    """
+    row: Row = {"wire": wire, "height_m": height, "seed": seed, "told": not blind, "error": ""}
+    with tempfile.TemporaryDirectory() as place:
+        track = Path(place) / "track.csv"
+        with EmulatorProcess(
+            "go2",
+            *("--transport", wire, "--port", PORTS[wire], "--seed", str(seed), "--profile", "realistic"),
+            *("--terrain", f"box:{height:g},{EDGE_M:g}", "--track-to", str(track)),
+        ) as emulator:
+            done = subprocess.run(
+                [
+                    *(sys.executable, "-m", "deal_hw", "deploy", "go2", "--transport", wire),
+                    *("--port", emulator.port, "--policy", policy, "--seconds", f"{SECONDS:g}"),
+                    *("--velocity", f"{AHEAD_M_S:g},0,0", "--out", str(Path(place) / "run")),
+                    *(() if blind else ("--obstacle", f"{EDGE_M:g},{height:g}")),
+                ],
+                input="y\n",
+                capture_output=True,
+                text=True,
+                timeout=LONGEST_S,
+            )
+        lines = done.stdout.splitlines()
+        ends = [line for line in lines if line.startswith(("finished", "tripped", "stopped", "failed"))]
+        furthest = float(read_track(track).place[:, 0].max())
+    row |= {
+        "exit_code": done.returncode,
+        "end": ends[-1] if ends else "",
+        "furthest_m": round(furthest, 3),
+        "climbed": done.returncode == 0 and furthest >= EDGE_M + BEYOND_M,
+    }
+    if not ends:
+        row["error"] = done.stderr.strip()[-500:] or "deploy printed no end"
+    return row
+
+
+def main() -> None:
+    """Climb as the command line says; print a row for each robot and wire."""
+    options = parser(__doc__)
+    options.add_argument("--policy", default="climb", help="a policy's file, or the name of a shipped one")
+    options.add_argument("--wires", nargs="+", choices=sorted(PORTS), default=sorted(PORTS))
+    options.add_argument("--height", type=float, default=0.1, help="of the platform [m]")
+    options.add_argument("--blind", action="store_true", help="tell the robot nothing")
+    add_seeds(options, 0)
+    args = options.parse_args()
+    rows = Rows(__file__, args.out)
+    for wire in args.wires:
+        for seed in args.seeds:
+            rows.add(measure(args.policy, wire, args.height, seed, blind=args.blind))
+
+
+if __name__ == "__main__":
+    main()
