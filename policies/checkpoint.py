@@ -134,12 +134,18 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint, layout: PolicySpec) -> 
         draft.unlink(missing_ok=True)
 
 
-def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
+def read_checkpoint(path: Path, layout: PolicySpec, *, own: int | None = None) -> Checkpoint:
     """Read a checkpoint of a policy with this layout.
 
     The layout may observe more: further terms after those of the checkpoint. ``notes["observed"]`` is the
     number of terms that the checkpoint's policy observes, and ``notes["same_task"]`` whether it observes all
     of them, in the same range of requested velocities.
+
+    Args:
+        path: The file.
+        layout: The layout of this training.
+        own: Number of the task's own terms, where the trainer added others. A checkpoint that observes just
+            these is of the same task, too.
 
     Raises:
         CheckpointError: The file is missing, is no checkpoint, or has another layout.
@@ -170,6 +176,6 @@ def read_checkpoint(path: Path, layout: PolicySpec) -> Checkpoint:
         raise CheckpointError(
             f"{path} is of a policy with another {', '.join(wrong)}; give a checkpoint of the same task"
         )
-    same = observed == len(layout.observation) and found.command_range == layout.command_range
+    same = observed in (len(layout.observation), own) and found.command_range == layout.command_range
     notes |= {"trained_under": found.trained_under, "observed": observed, "same_task": same}
     return Checkpoint(tensors=tensors, notes=notes, path=path)

@@ -15,7 +15,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterDistribution
 from deal_hw.policies.go2_env import Go2Env, WalkTask, walk_spec
 from deal_hw.policies.servo_loop import BoolArray
-from deal_hw.policies.vector_env import check_task
+from deal_hw.policies.vector_env import Extrinsics, check_task
 from deal_hw.policy import CLIMBED, OBSTACLE_AXES, ObservationTerm, PolicySpec
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
@@ -33,6 +33,10 @@ MOST: Final = 0.5
 least ``LEAST_TRIES``."""
 TRIED_M: Final = 0.5
 """A robot tried to climb if it was requested to walk so far beyond the edge [m]."""
+FELT_AHEAD_M: Final = (0.0, 0.1)
+"""Places of the ground that a leg may feel, from its foot along the world's x axis [m]."""
+GROUND_M: Final = 0.1
+"""Usual height of a platform [m]."""
 FREE_M: Final = 0.3
 """Distance from the edge within which the wanted height of a foot is another one [m]."""
 
@@ -191,6 +195,16 @@ class ClimbEnv(Go2Env):
         x = self.loop.position[:, :1]
         ground = self.platforms.height(x + np.array(AHEAD_M)) - self.platforms.height(x)
         return np.hstack([super().privileged(), 4.0 * ground])
+
+    def extrinsics(self) -> Extrinsics:
+        """Return what is known of the robots, and the ground below each foot and just ahead of it."""
+        feet, base = np.asarray(self._places[:, self._feet])[..., 0], self.loop.position[:, :1]
+        here = self.platforms.height(base)
+        ground = np.hstack([self.platforms.height(feet + ahead) - here for ahead in FELT_AHEAD_M])
+        # Feet are known one step after a state is set, and a robot starts on the floor.
+        ground[self._elapsed == 0] = 0.0
+        names = [f"{foot}.ground+{ahead:g}m" for ahead in FELT_AHEAD_M for foot in self.description.feet]
+        return super().extrinsics().and_more(names, GROUND_M, ground)
 
     def on_top(self) -> BoolArray:
         """Return which feet are over the platform and not below its top, (N, F)."""

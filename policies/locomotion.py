@@ -181,6 +181,7 @@ def judge(policy: BatchPolicy, env: LocomotionEnv, seed: int) -> dict[str, Any]:
         robot's mean speed from its mean commanded one. ``outcomes`` are means of what the task reached at
         the episodes' ends.
     """
+    env.observe_for(policy.spec)
     observation, _ = env.reset(seed=seed)
     count = env.num_envs
     going, total, lasted, way = np.ones(count, dtype=bool), np.zeros(count), np.zeros(count), np.zeros(count)

@@ -76,6 +76,26 @@ class FeedbackNetwork(torch.nn.Module):
         return torch.nn.functional.hardtanh(self.network(observation) + self.feedback(observation))
 
 
+class AdaptedNetwork(torch.nn.Module):
+    """A policy that is given the first terms of the observation, and what an adaptation module makes of all.
+
+    Attributes:
+        policy: Own terms and encoding, (B, own + Z), in; actions, (B, A), out.
+        adaptation: Observations (B, O) in, encodings (B, Z) out.
+        own: Number of the first terms.
+    """
+
+    def __init__(self, policy: torch.nn.Module, adaptation: torch.nn.Module, own: int) -> None:
+        super().__init__()
+        self.policy, self.adaptation, self.own = policy, adaptation, own
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Return the actions, (B, A), for observations, (B, O)."""
+        given = [observation[:, : self.own], self.adaptation(observation)]
+        actions: torch.Tensor = self.policy(torch.cat(given, dim=-1))
+        return actions
+
+
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
     """Limit torch to one thread inside the context.

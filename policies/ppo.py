@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +34,9 @@ from deal_hw.policies.network_policy import (
 )
 from deal_hw.policies.training_log import TrainingLog
 from deal_hw.policies.vector_env import ServoVectorEnv, TaskKnowledge
-from deal_hw.policy import Observation
+from deal_hw.policy import Observation, PolicySpec
 from deal_hw.training import TrainingFiles, TrainingProgress, TrainingStatus
+from deal_hw.types import FloatArray
 
 CLIP: Final = 0.2
 """Largest relative change of an action's probability in an update: the value of PPO's authors (arXiv
@@ -87,7 +90,7 @@ class PpoTrainer:
     """
 
     name = "ppo"
-    config = PpoConfig
+    config: ClassVar[Callable[..., Any]] = PpoConfig
 
     def train(
         self,
@@ -117,8 +120,8 @@ class PpoTrainer:
         with one_thread(), TrainingLog(files.log) as log:
             seed = int(rng.integers(2**31))
             torch.manual_seed(seed)
-            learner = _Learner(env, config)
-            found = files.source(env.layout, read_checkpoint)
+            learner = self.learner(env, config)
+            found = files.source(env.layout, learner.read)
             if found is not None:
                 if files.resume:
                     found.check_resumed(env.layout, config.steps)
@@ -127,7 +130,7 @@ class PpoTrainer:
                 seed = int(np.random.default_rng([seed, learner.steps]).integers(2**31))
                 torch.manual_seed(seed)
             learner.begin(seed)
-            with ended_by(files.stop, learner.optimiser) as check:
+            with ended_by(files.stop, *learner.optimisers) as check:
                 while learner.steps < config.steps:
                     losses = learner.update(check)
                     if not learner.is_finite:
@@ -148,21 +151,45 @@ class PpoTrainer:
         spec = trained_spec(
             env, self.name, config, seed, rsl_rl=version("rsl-rl-lib"), torch=str(torch.__version__)
         )
+        spec = dataclasses.replace(spec, training={**spec.training, **learner.reached()})
         return NetworkPolicy(learner.network(), spec)
 
+    def learner(self, env: ServoVectorEnv, config: Any) -> PpoLearner:
+        """Return what learns."""
+        return PpoLearner(env, config)
 
-class _Learner:
-    """rsl-rl's PPO with an environment of ours."""
+
+class PpoLearner:
+    """rsl-rl's PPO with an environment of ours.
+
+    Attributes:
+        trainer: Name of the trainer, in checkpoints.
+        starts_from: Trainers whose checkpoints may be the start of a training.
+        actor_model: Class of the actor.
+        groups: What actor and critic are given.
+        steps: Environment steps so far.
+        updates: Updates so far.
+        optimisers: Those of the training.
+    """
+
+    trainer: ClassVar[str] = PpoTrainer.name
+    starts_from: ClassVar[Sequence[str]] = (PpoTrainer.name,)
+    _memories: ClassVar[Sequence[str]] = ("optimizer",)
+    actor_model: ClassVar[type[MLPModel]] = MLPModel
+    groups: ClassVar[Mapping[str, Sequence[str]]] = {
+        "actor": ("observation",),
+        "critic": ("observation", "privileged"),
+    }
 
     def __init__(self, env: ServoVectorEnv, config: PpoConfig) -> None:
         self._env, self._config = env, config
         self._device = learning_device(env)
         O, A = len(env.layout.observation), len(env.layout.actuated)  # noqa: E741
         example = self._batch(np.zeros((env.num_envs, O), dtype=np.float32))
-        groups = {"actor": ["observation"], "critic": ["observation", "privileged"]}
+        groups = {name: list(parts) for name, parts in self.groups.items()}
         spread = {"class_name": "GaussianDistribution", "init_std": config.exploration, "std_type": "log"}
         hidden = list(config.hidden)
-        actor = MLPModel(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
+        actor = self.actor_model(example, groups, "actor", A, hidden, "elu", distribution_cfg=spread)
         self._actor = actor.to(self._device)
         self._critic = MLPModel(example, groups, "critic", 1, hidden, "elu").to(self._device)
         # Small first actions: learning starts at the default pose, not at a random one.
@@ -182,14 +209,14 @@ class _Learner:
             entropy_coef=config.entropy,
             learning_rate=config.learning_rate,
             desired_kl=config.divergence,
-            symmetry_cfg=_symmetry(env, self._device),
+            symmetry_cfg=self._symmetry(),
             device=self._device,
         )
         self.steps = self.updates = 0
         self._return = np.zeros(env.num_envs)
         self._recent: collections.deque[float] = collections.deque(maxlen=100)
         self._before: float | None = None
-        self.optimiser: torch.optim.Optimizer = self._ppo.optimizer
+        self.optimisers: list[torch.optim.Optimizer] = [self._ppo.optimizer]
 
     def begin(self, seed: int) -> None:
         """Start the episodes."""
@@ -201,22 +228,39 @@ class _Learner:
         with torch.no_grad():
             for _ in range(config.rollout):
                 check()
-                action = ppo.act(self._seen) + self._feedback(self._seen["observation"])
-                action = action.cpu().numpy().astype(np.float64)
-                seen, reward, terminated, truncated, _ = self._env.step(action)
-                over = terminated | truncated
-                self._return += reward
-                self._recent.extend(float(x) for x in self._return[over])
-                self._return[over] = 0.0
-                self._seen = self._batch(seen)
+                reward, over, truncated = self._step(
+                    ppo.act(self._seen) + self._feedback(self._seen["observation"])
+                )
                 scaled = self._tensor((reward * config.reward_scale).astype(np.float32))
                 ends = {"time_outs": self._tensor(truncated)}
                 ppo.process_env_step(self._seen, scaled, self._tensor(over), ends)
             ppo.compute_returns(self._seen)
         losses = ppo.update()
-        self.steps += config.rollout * self._env.num_envs
-        self.updates += 1
+        self._count_update()
         return {**losses, "learning_rate": ppo.learning_rate, "exploration": self._exploration()}
+
+    def _step(self, action: torch.Tensor) -> tuple[FloatArray, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Take actions, (N, A); return rewards, which episodes are over and which of these by time, (N,)."""
+        given = action.cpu().numpy().astype(np.float64)
+        seen, reward, terminated, truncated, _ = self._env.step(given)
+        over = terminated | truncated
+        self._return += reward
+        self._recent.extend(float(x) for x in self._return[over])
+        self._return[over] = 0.0
+        self._seen = self._batch(seen)
+        return reward, over, truncated
+
+    def _count_update(self) -> None:
+        self.steps += self._config.rollout * self._env.num_envs
+        self.updates += 1
+
+    def read(self, path: Path, layout: PolicySpec) -> Checkpoint:
+        """Read a checkpoint to start or go on from."""
+        return read_checkpoint(path, layout)
+
+    def reached(self) -> dict[str, Any]:
+        """Return what is to be in the policy's record, plain JSON values; nothing by default."""
+        return {}
 
     @property
     def mean_return(self) -> float | None:
@@ -226,7 +270,7 @@ class _Learner:
     @property
     def is_finite(self) -> bool:
         """Whether all weights are finite."""
-        return is_finite(self._actor, self._critic)
+        return is_finite(*self._parts().values())
 
     def network(self) -> torch.nn.Module:
         """Return the actor without exploration, as layers, on the CPU from now on."""
@@ -239,15 +283,15 @@ class _Learner:
     def checkpoint(self) -> Checkpoint:
         """Return the state needed to continue."""
         tensors = {
-            f"{part}.{name}": value
-            for part, model in (("actor", self._actor), ("critic", self._critic))
+            f"{part}.{name}": value.cpu()
+            for part, model in self._parts().items()
             for name, value in model.state_dict().items()
         }
-        for i, state in self._ppo.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{i}.{name}": value for name, value in state.items()}
-        tensors = {name: value.cpu() for name, value in tensors.items()}
+        for part, optimiser in zip(self._memories, self.optimisers, strict=True):
+            for i, state in optimiser.state_dict()["state"].items():
+                tensors |= {f"{part}.{i}.{name}": value.cpu() for name, value in state.items()}
         notes = {
-            "trainer": PpoTrainer.name,
+            "trainer": self.trainer,
             "steps": self.steps,
             "updates": self.updates,
             "learning_rate": self._ppo.learning_rate,
@@ -259,12 +303,10 @@ class _Learner:
 
     def load(self, found: Checkpoint, *, whole: bool) -> None:
         """Load the networks and, with ``whole``, the state of the training."""
-        found.check(trainer=PpoTrainer.name, hidden=list(self._config.hidden))
-        observed = int(found.notes["observed"])
-        more = len(self._env.layout.observation) - observed
-        added = None if whole else (observed, more)
-        for part, model in (("actor", self._actor), ("critic", self._critic)):
-            model.load_state_dict(found.part(part, model.state_dict(), added))
+        if whole or found.notes.get("trainer") not in self.starts_from:
+            found.check(trainer=self.trainer)
+        found.check(hidden=list(self._config.hidden))
+        self._load_networks(found, whole)
         if found.notes["same_task"]:
             self._env.go_on(found.notes.get("progress", {}))
         if not whole:
@@ -274,21 +316,41 @@ class _Learner:
                 with torch.no_grad():
                     spread.log_std_param.fill_(math.log(self._config.exploration))
             return
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for name, value in found.tensors.items():
-            if name.startswith("optimizer."):
-                _, index, key = name.split(".", 2)
-                state.setdefault(int(index), {})[key] = value
-        groups = self._ppo.optimizer.state_dict()["param_groups"]
-        self._ppo.learning_rate = groups[0]["lr"] = float(found.notes["learning_rate"])
-        self._ppo.optimizer.load_state_dict({"state": state, "param_groups": groups})
+        for part, optimiser in zip(self._memories, self.optimisers, strict=True):
+            state: dict[int, dict[str, torch.Tensor]] = {}
+            for name, value in found.tensors.items():
+                if name.startswith(f"{part}."):
+                    _, index, key = name.split(".", 2)
+                    state.setdefault(int(index), {})[key] = value
+            groups = optimiser.state_dict()["param_groups"]
+            optimiser.load_state_dict({"state": state, "param_groups": groups})
+        self._ppo.learning_rate = float(found.notes["learning_rate"])
+        self._ppo.optimizer.param_groups[0]["lr"] = self._ppo.learning_rate
         self.steps, self.updates = int(found.notes["steps"]), int(found.notes["updates"])
         self._before = found.notes.get("mean_return")
 
+    def _load_networks(self, found: Checkpoint, whole: bool) -> None:
+        observed = int(found.notes["observed"])
+        more = len(self._env.layout.observation) - observed
+        added = None if whole else (observed, more)
+        for part, model in self._parts().items():
+            model.load_state_dict(found.part(part, model.state_dict(), added))
+
+    def _parts(self) -> dict[str, torch.nn.Module]:
+        """Return the networks by their names in a checkpoint."""
+        return {"actor": self._actor, "critic": self._critic}
+
     def _batch(self, observation: Observation) -> TensorDict:
-        parts = {"observation": observation, "privileged": self._env.privileged().astype(np.float32)}
-        tensors = {name: self._tensor(part) for name, part in parts.items()}
+        tensors = {name: self._tensor(part) for name, part in self._given(observation).items()}
         return TensorDict(tensors, batch_size=[self._env.num_envs], device=self._device)
+
+    def _given(self, observation: Observation) -> dict[str, npt.NDArray[np.float32]]:
+        """Return what the networks are given, by group, (N, n) each."""
+        return {"observation": observation, "privileged": self._env.privileged().astype(np.float32)}
+
+    def _symmetry(self) -> dict[str, Any] | None:
+        """Return rsl-rl's settings to learn from reflections, too; None for a robot without symmetry."""
+        return _symmetry(self._env, self._device)
 
     def _tensor(self, values: npt.NDArray[Any]) -> torch.Tensor:
         return torch.as_tensor(values, device=self._device)

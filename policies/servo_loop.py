@@ -76,6 +76,11 @@ class ServoLoop:
         self.reported_velocity = np.zeros((count, C))
 
     @property
+    def theta(self) -> FloatArray:
+        """Each member's parameters, (N, K)."""
+        return self._theta
+
+    @property
     def position(self) -> FloatArray:
         """True positions, (N, C)."""
         return self._state()[0]

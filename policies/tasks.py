@@ -64,6 +64,10 @@ _STRIDE_PPO: Final = {
 }
 
 
+_AS: Final = {"rma": "ppo"}
+"""Trainers with the usual settings of another one, on which they stand."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingTask:
     """A robot's training; the defaults are those of its shipped policy.
@@ -72,7 +76,7 @@ class TrainingTask:
         environment: The environment, "module:class"; called as ``environment(description, distribution,
             members)``.
         trainer: The default trainer's name.
-        members: Robots simulated at once, by trainer.
+        members: Robots simulated at once, by trainer; see :meth:`usual_members`.
         settings: The trainers' settings that differ from their defaults, by trainer.
         udr_ratio: Factor of uniform domain randomisation on either side of each nominal value.
         udr_latency_s: Lowest and highest total latency of it [s].
@@ -90,6 +94,10 @@ class TrainingTask:
         module, _, name = self.environment.partition(":")
         return getattr(importlib.import_module(module), name)(*arguments, **more)
 
+    def usual_members(self, trainer: str) -> int:
+        """Return how many robots a trainer simulates at once."""
+        return self.members[_AS.get(trainer, trainer)]
+
     def trainer_and_config(self, trainer: str | None = None, steps: int | None = None) -> tuple[Any, Any]:
         """Return a trainer and its settings for this task.
 
@@ -102,7 +110,7 @@ class TrainingTask:
         """
         name = trainer or self.trainer
         made = make_trainer(name)
-        settings = dict(self.settings.get(name, {}))
+        settings = dict(self.settings.get(_AS.get(name, name), {}))
         if steps is not None:
             settings["steps"] = steps
         return made, made.config(**settings)

@@ -9,6 +9,7 @@ from deal_hw.errors import UnknownNameError
 
 TRAINERS: dict[str, str] = {
     "ppo": "deal_hw.policies.ppo:PpoTrainer",
+    "rma": "deal_hw.policies.rma:RmaTrainer",
     "sac": "deal_hw.policies.sac:SacTrainer",
 }
 

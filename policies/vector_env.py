@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import abc
 import copy
+import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -18,10 +19,13 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
-from deal_hw.policy import Observation, ObservationBuilder, PolicySpec
+from deal_hw.policy import BASE_QUANTITIES, Observation, ObservationBuilder, PolicySpec
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray
+
+FELT: Final = ("position", "velocity", "sin_position", "cos_position", "action", *BASE_QUANTITIES)
+"""Quantities that tell of the robot itself: its joints, its actions and its base."""
 
 
 def check_task(task: Any, *positive: str) -> None:
@@ -50,8 +54,29 @@ class Mirror:
     sign: tuple[float, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Extrinsics:
+    """What a simulator knows of its robots and a robot does not measure.
+
+    Attributes:
+        names: Names, (E,).
+        size: Usual deviation of each, above 0, (E,).
+        values: Deviations of each member from the model's nominal value, (N, E): of parameters with a log
+            scale the logarithm of the ratio, of others the difference in their unit.
+    """
+
+    names: tuple[str, ...]
+    size: FloatArray
+    values: FloatArray
+
+    def and_more(self, names: Sequence[str], size: float, values: FloatArray) -> Extrinsics:
+        """Return these, followed by M others with one usual deviation, whose values are (N, M)."""
+        sizes = np.concatenate([self.size, np.full(len(names), size)])
+        return Extrinsics((*self.names, *names), sizes, np.hstack([self.values, values]))
+
+
 class TaskKnowledge:
-    """What PPO may use of a task beside its transitions; nothing by default.
+    """What trainers may use of a task beside its transitions; nothing by default.
 
     Attributes:
         layout: Layout of observation and action.
@@ -86,6 +111,21 @@ class TaskKnowledge:
         """
         return None
 
+    def extrinsics(self) -> Extrinsics | None:
+        """Return what the simulator knows of its members now; None where nothing is known by name."""
+        return None
+
+    def observe_history(self, periods: int) -> None:
+        """Extend the observation by what was felt and done in so many former control periods.
+
+        Raises:
+            ConfigurationError: The task has an observation of its own, whose past is not known.
+        """
+        raise ConfigurationError(
+            f"the observation of this task cannot be extended by {periods} former control periods; train it "
+            "with ppo or sac"
+        )
+
 
 class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc.ABC):
     """N robots that follow a policy's commands; a task defines starts and rewards.
@@ -108,6 +148,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
 
     Attributes:
         layout: Layout of observation and action.
+        own_terms: Number of terms of the task's own observation; they come first.
         failure_reward: The reward of the tick in which a member fails.
     """
 
@@ -127,25 +168,26 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
         engine: EngineName = "mujoco",
         step_s: float | None = None,
     ) -> None:
-        self.description, self.distribution, self.layout = description, distribution, layout
+        self.description, self.distribution = description, distribution
         self.num_envs = count
+        self._observe_as(layout)
+        self.own_terms = len(layout.observation)
         self.ticks = ticks
         self.engine = engine
         self.host_delay_s = host_delay_s
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-        O, A = len(layout.observation), len(layout.actuated)  # noqa: E741
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (O,), np.float32)
-        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (A,), np.float32)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, count)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(layout.actuated),), np.float32)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, count)
         # Calibrated parameters come first: the task draws only those that the distribution does not have.
         given = {(p.kind, name) for p in distribution.space.parameters for name in p.elements}
         self._extra = ParameterSpace(
             p for p in self.surroundings() if not given & {(p.kind, name) for name in p.elements}
         )
+        self._space = ParameterSpace([*distribution.space.parameters, *self._extra.parameters])
+        self._latency_s = np.zeros(count)
         self.loop = ServoLoop(
             description,
-            ParameterSpace([*distribution.space.parameters, *self._extra.parameters]),
+            self._space,
             count,
             sensor=sensor,
             threads=threads,
@@ -153,7 +195,6 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
             step_s=step_s,
             scene=self.scene,
         )
-        self._builder = ObservationBuilder(layout, (count,))
         self._elapsed = np.zeros(count, dtype=np.int64)
         self._recent_shares: deque[float] = deque(maxlen=100)
         self._scale = np.array(layout.action_scale)
@@ -189,6 +230,43 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
     def privileged(self) -> FloatArray:
         """Return the critic's information beyond the observation, (N, P); nothing by default."""
         return np.zeros((self.num_envs, 0))
+
+    def extrinsics(self) -> Extrinsics:
+        """Return the drawn parameters and the total latency; E is 1 more than the free parameters."""
+        space = self._space
+        drawn = space.to_scale(self.loop.theta) - space.to_scale(space.nominal)
+        known = Extrinsics(space.names, np.where(space.log_scale, 1.0, 0.5 * space.width), drawn)
+        return known.and_more(["latency"], 1.0 / self.description.control_rate_hz, self._latency_s[:, None])
+
+    def observe_history(self, periods: int) -> None:
+        """Extend the observation by what was felt and done in former control periods; restart before a step.
+
+        The new terms come last, one quantity after the other: those of joints, of the action and of the base,
+        but not what the operator or a clock says. Those of a former call are replaced.
+        """
+        own = self.layout.observation[: self.own_terms]
+        former = [
+            dataclasses.replace(term, delay=term.delay + back)
+            for quantity in FELT
+            for back in range(1, periods + 1)
+            for term in own
+            if term.quantity == quantity
+        ]
+        more = [term for term in dict.fromkeys(former) if term not in own]
+        self._observe_as(dataclasses.replace(self.layout, observation=(*own, *more)))
+
+    def observe_for(self, policy: PolicySpec) -> None:
+        """Observe what a policy observes, which may be other terms than the task's; restart before a step."""
+        self._observe_as(dataclasses.replace(self.layout, observation=policy.observation))
+
+    def _observe_as(self, layout: PolicySpec) -> None:
+        self.layout = layout
+        self._builder = ObservationBuilder(layout, (self.num_envs,))
+        size = (len(layout.observation),)
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, size, np.float32)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, self.num_envs
+        )
 
     def target(self, action: FloatArray) -> FloatArray:
         """Return the targets of actions, (N, A) each."""
@@ -265,6 +343,7 @@ class ServoVectorEnv(TaskKnowledge, VectorEnv[Observation, FloatArray, Any], abc
         position, velocity = self.start_state(rng, count)
         start = self.start_setpoint()
         setpoint = None if start is None else np.repeat(start[None], count, axis=0)
+        self._latency_s[where] = latency
         self.loop.restart(where, theta, latency, position, velocity, rng, setpoint)
         self._builder.reset(where)
         self.begin_episodes(where, rng)

@@ -126,6 +126,7 @@ def episode(robot: str, policy: OnnxPolicy, seed: int, seconds: float) -> tuple[
     """Return a robot's MuJoCo positions after each control period, (T, nq), its target, and how it ended."""
     description = recorded_description(robot)
     env = training_task(robot).make(description, udr_distribution(robot), 1)
+    env.observe_for(policy.spec)
     observation, _ = env.reset(seed=seed)
     target = env.wanted[0].copy() if robot == "allegro" else np.zeros(3)
     states, places = env.loop.batch.batch.bind("qpos"), []

@@ -1,4 +1,4 @@
-"""Make the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
+r"""Make the shipped policies of Allegro hand, ant, humanoid and Go2, trained under uniform randomisation.
 
     python tools/train_demo_policy.py allegro --checkpoint runs/base/allegro.safetensors --hours 1
     python tools/train_demo_policy.py ant
@@ -6,10 +6,12 @@
     python tools/train_demo_policy.py go2
     python tools/train_demo_policy.py go2 --task canter --start policies/assets/go2_walk.safetensors
     python tools/train_demo_policy.py go2 --task climb --start policies/assets/go2_walk.safetensors
+    python tools/train_demo_policy.py go2 --task climb --trainer rma \
+        --start policies/assets/go2_climb.safetensors
 
-writes policies/assets/allegro_turn.onnx, ant_udr.onnx, humanoid_walk.onnx, go2_walk.onnx, go2_canter.onnx or
-go2_climb.onnx and, beside it, the record of its training and of its results on other robots. Task, trainer
-and settings are those of `deal-hw train ROBOT --udr`, with `--task` for canter and climb.
+writes policies/assets/allegro_turn.onnx, ant_udr.onnx, humanoid_walk.onnx, go2_walk.onnx, go2_canter.onnx,
+go2_climb.onnx or go2_climb_rma.onnx and, beside it, the record of its training and of its results on other
+robots. Task, trainer and settings are those of `deal-hw train ROBOT --udr`, with `--task` and `--trainer`.
 
 `--hours` ends the training after so many processor hours, those of the stopped parts included. The same
 command with `--resume` goes on from the checkpoint, also after a crash. The curve of the return against steps
@@ -40,6 +42,7 @@ import numpy as np
 from deal_hw.policies.checkpoint import read_checkpoint, write_checkpoint
 from deal_hw.policies.locomotion import judge
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policies.trainers import TRAINERS
 from deal_hw.robots import recorded_description, training_task
 from deal_hw.training import TrainingFiles, TrainingStatus
 from deal_hw.workflows.train import train_policy, udr_distribution
@@ -133,6 +136,7 @@ def train(
     start: Path | None = None,
     hours: float = math.inf,
     task: str = "",
+    trainer: str | None = None,
 ) -> OnnxPolicy:
     """Train, judge and write a policy; return it, read back from its file."""
     if checkpoint is not None:
@@ -143,6 +147,7 @@ def train(
         udr_distribution(robot, task),
         path,
         task=task,
+        trainer=trainer,
         seed=seed,
         steps=steps,
         members=members,
@@ -177,7 +182,7 @@ def _short(points: Sequence[Mapping[str, float | None]]) -> list[dict[str, float
 def ship_checkpoint(source: Path, policy: OnnxPolicy) -> None:
     """Write a checkpoint's networks beside a policy, to fine-tune from; not the optimiser's memory."""
     found = read_checkpoint(source, policy.spec)
-    kept = {name: value for name, value in found.tensors.items() if not name.startswith("optimizer.")}
+    kept = {name: value for name, value in found.tensors.items() if "optimizer." not in name}
     write_checkpoint(
         policy.path.with_suffix(".safetensors"), dataclasses.replace(found, tensors=kept), policy.spec
     )
@@ -213,6 +218,7 @@ def main() -> None:
     )
     parser.add_argument("robot", choices=sorted(FILES))
     parser.add_argument("--task", default="", choices=["", *(task for _, task in OTHER_TASKS)])
+    parser.add_argument("--trainer", choices=sorted(TRAINERS), help="by default that of the shipped policy")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, help="environment steps; by default those of the shipped policy")
     parser.add_argument("--members", type=int, help="by default those of the shipped policy")
@@ -229,6 +235,7 @@ def main() -> None:
     parser.add_argument("--judge", action="store_true", help="do not train: evaluate the existing file")
     args = parser.parse_args()
     name = OTHER_TASKS[args.robot, args.task] if args.task else FILES[args.robot]
+    name += "_rma" if args.trainer == "rma" else ""
     path = args.out or ASSETS / f"{name}.onnx"
     if args.judge:
         record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
@@ -248,6 +255,7 @@ def main() -> None:
         start=args.start,
         hours=args.hours,
         task=args.task,
+        trainer=args.trainer,
     )
 
 

@@ -70,6 +70,7 @@ def target_env(task: str, truth: ParameterDistribution, count: int, ticks: int |
 def judged(task: str, truth: ParameterDistribution, policy: BatchPolicy, seed: int) -> Row:
     """Return the returns of a policy's episodes in a target: mean and worst, and how long they lasted."""
     env = target_env(task, truth, EPISODES)
+    env.observe_for(policy.spec)
     observation, _ = env.reset(seed=seed + JUDGED)
     going, total, lasted = np.ones(EPISODES, dtype=bool), np.zeros(EPISODES), np.zeros(EPISODES)
     upright = TASKS[task].upright
@@ -115,6 +116,7 @@ def speed_profile(
     wanted = np.repeat(asked_for, round(STEP_S * rate_hz), axis=0)
     # One tick more: the environment restarts a robot in the tick in which its time is over.
     env = target_env(task, truth, count, ticks=len(wanted) + 1)
+    env.observe_for(policy.spec)
     observation, _ = env.reset(seed=seed + JUDGED)
     going = np.ones(count, dtype=bool)
     speeds = np.zeros((len(wanted), count, 2))

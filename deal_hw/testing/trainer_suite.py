@@ -111,9 +111,12 @@ class TrainerSuite:
         assert case.score(short) < case.learned
 
     def test_policy_carries_layout_and_digest(self, case: TrainerCase, short: Policy) -> None:
-        """The policy's spec has its observations, its action and the parameters of its training."""
+        """The policy's spec has its observations, its action and the parameters of its training.
+
+        A trainer may add terms after those of the task.
+        """
         spec = short.spec
-        assert spec.observation == case.layout.observation
+        assert spec.observation[: len(case.layout.observation)] == case.layout.observation
         assert spec.action_scale == case.layout.action_scale
         assert spec.joint_names == case.layout.joint_names
         assert spec.trained_under == case.distribution.digest()
@@ -183,7 +186,7 @@ class TrainerSuite:
         file = tmp_path / "checkpoint.safetensors"
         file.write_bytes(second.checkpoint)
         started = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(start=file, stop=lambda: True))
-        observation = np.linspace(-1.0, 1.0, len(case.layout.observation), dtype=np.float32)
+        observation = np.linspace(-1.0, 1.0, len(second.policy.spec.observation), dtype=np.float32)
         fresh = case.train(case.config, seed=_SEED + 1, files=TrainingFiles(stop=lambda: True))
         first = second.policy.act(observation)
         gap = np.abs(started.act(observation) - first).max()

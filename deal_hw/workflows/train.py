@@ -66,7 +66,8 @@ class TrainSettings(Checked):
     """Train under the model's nominal values instead; latency as with --udr."""
 
     trainer: str | None = None
-    """ppo or sac; by default that of the robot's shipped policy."""
+    """ppo, sac or rma: PPO of a policy that knows the simulated robot's parameters, then of a network that
+    feels them. By default that of the robot's shipped policy."""
 
     out: File = Path("runs") / "train"
     """The .onnx file to write, or a run folder, in which the file is policies/policy.onnx. Checkpoint
@@ -343,7 +344,7 @@ def train_policy(
 
     chosen = OWN_TASK if env else training_task(robot, task)
     teacher, config = chosen.trainer_and_config(trainer, steps)
-    count, description = members or chosen.members[teacher.name], described(robot)
+    count, description = members or chosen.usual_members(teacher.name), described(robot)
     if env:
         world = chosen.make(env, description, distribution, count)
     else:

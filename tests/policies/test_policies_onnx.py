@@ -72,6 +72,31 @@ def test_a_tiny_network_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(policy.act(np.array([0.1], dtype=np.float32)), [np.tanh(0.7)], atol=1e-6)
 
 
+def test_an_adapted_policy_by_hand(tmp_path: Path) -> None:
+    """Of terms a, b: z = 0.5 a - b, then 2 a + 3 z + 0.1, clipped; a feedback is added before."""
+    import torch
+
+    from deal_hw.policies.network_policy import AdaptedNetwork, Feedback, FeedbackNetwork
+
+    def linear(weights: list[float], bias: float) -> torch.nn.Linear:
+        layer = torch.nn.Linear(len(weights), 1)
+        with torch.no_grad():
+            layer.weight[:] = torch.tensor(weights)
+            layer.bias[:] = bias
+        return layer
+
+    terms = (ObservationTerm("position", "pole", 1.0), ObservationTerm("position", "pole", 1.0, 1))
+    spec = dataclasses.replace(SPEC, observation=terms)
+    policy, felt = torch.nn.Sequential(linear([2.0, 3.0], 0.1)), torch.nn.Sequential(linear([0.5, -1.0], 0.0))
+    observed = np.array([[0.1, 0.2], [0.5, 0.0], [0.0, -0.1]], dtype=np.float32)
+    bounded = torch.nn.Sequential(*policy, torch.nn.Hardtanh())
+    plain = export_network(AdaptedNetwork(bounded, felt, 1), spec, tmp_path / "plain.onnx")
+    np.testing.assert_allclose(plain.act_batch(observed)[:, 0], [-0.15, 1.0, 0.4], atol=1e-6)
+    fed = FeedbackNetwork(AdaptedNetwork(policy, felt, 1), Feedback(np.array([[0.0, -2.0]])))
+    summed = export_network(fed, spec, tmp_path / "fed.onnx")
+    np.testing.assert_allclose(summed.act_batch(observed)[:, 0], [-0.55, 1.0, 0.6], atol=1e-6)
+
+
 def test_file_is_one_file_with_its_record_beside_it(file: Path) -> None:
     """No side file holds weights, no draft is left, and nothing in it tells of the machine that wrote it."""
     assert sorted(p.name for p in file.parent.iterdir()) == ["policy.json", "policy.onnx"]

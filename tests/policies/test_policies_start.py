@@ -33,17 +33,17 @@ def test_a_climb_starts_with_what_the_walk_does() -> None:
     from deal_hw.policies.checkpoint import read_checkpoint
     from deal_hw.policies.network_policy import NetworkPolicy
     from deal_hw.policies.onnx_runtime import OnnxPolicy
-    from deal_hw.policies.ppo import PpoConfig, _Learner
+    from deal_hw.policies.ppo import PpoConfig, PpoLearner
 
     env = climb()
-    learner = _Learner(env, PpoConfig())
+    learner = PpoLearner(env, PpoConfig())
     found = read_checkpoint(WALK, env.layout)
     learner.load(found, whole=False)
     assert found.notes["observed"] == len(env.layout.observation) - TOLD
     # Another task is explored anew; the same one goes on as it was.
     assert not found.notes["same_task"] and learner._exploration() == pytest.approx(PpoConfig().exploration)
     walk_env = training_task("go2").make(recorded_description("go2"), nominal_distribution("go2"), 1)
-    same = _Learner(walk_env, PpoConfig())
+    same = PpoLearner(walk_env, PpoConfig())
     same.load(read_checkpoint(WALK, walk_env.layout), whole=False)
     assert same._exploration() < 0.3
     seen = np.random.default_rng(0).standard_normal((5, len(env.layout.observation))).astype(np.float32)

@@ -60,6 +60,14 @@ def export(policy: Policy, path: Path) -> Policy:
     return export_network(policy.network, policy.spec, path)
 
 
+ON_POLICY: dict[str, Any] = {
+    "hidden": (32, 32),
+    "rollout": 16,
+    "learning_rate": 3e-3,
+    "reward_scale": 0.1,
+}
+
+
 def toy_case(trainer: Any, members: int, config: Any, short_config: Any) -> TrainerCase:
     """Return a trainer with the toy."""
     return TrainerCase(
@@ -91,13 +99,21 @@ def ppo_case() -> TrainerCase:
     """Return PPO and the toy."""
     from deal_hw.policies.ppo import PpoConfig, PpoTrainer
 
-    settings: dict[str, Any] = {
-        "hidden": (32, 32),
-        "rollout": 16,
-        "learning_rate": 3e-3,
-        "reward_scale": 0.1,
-    }
-    return toy_case(PpoTrainer(), 64, PpoConfig(steps=60_000, **settings), PpoConfig(steps=1_024, **settings))
+    return toy_case(
+        PpoTrainer(), 64, PpoConfig(steps=60_000, **ON_POLICY), PpoConfig(steps=1_024, **ON_POLICY)
+    )
+
+
+def rma_case() -> TrainerCase:
+    """Return RMA and the toy; its short training has an update of each phase."""
+    from deal_hw.policies.rma import RmaConfig, RmaTrainer
+
+    return toy_case(
+        RmaTrainer(),
+        64,
+        RmaConfig(steps=80_000, history=5, **ON_POLICY),
+        RmaConfig(steps=2_048, history=5, adaptation=0.5, **ON_POLICY),
+    )
 
 
 @pytest.mark.slow
@@ -122,7 +138,18 @@ class TestPpo(TrainerSuite):
         return ppo_case()
 
 
-@pytest.mark.parametrize("make", [sac_case, ppo_case])
+@pytest.mark.slow
+class TestRma(TrainerSuite):
+    """RMA keeps the contract of trainers."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> TrainerCase:
+        """Return RMA and the toy."""
+        return rma_case()
+
+
+@pytest.mark.parametrize("make", [sac_case, ppo_case, rma_case])
 def test_a_request_to_stop_is_heard_within_an_update(make: Callable[[], TrainerCase], tmp_path: Path) -> None:
     """On a slow computer an update takes minutes: no further optimiser step, whole files.
 
@@ -297,7 +324,7 @@ def test_every_trainer_loads_under_its_name(name: str) -> None:
 
 def test_unknown_trainer_lists_the_trainers() -> None:
     """A wrong name is answered with the right ones."""
-    with pytest.raises(UnknownNameError, match=r"td3.*ppo, sac"):
+    with pytest.raises(UnknownNameError, match=r"td3.*ppo, rma, sac"):
         make_trainer("td3")
 
 
@@ -307,7 +334,7 @@ def test_every_task_has_settings_for_every_trainer(robot: str, name: str) -> Non
     """A trainer beside the usual one can be chosen for each robot, and the steps with it."""
     trainer, config = training_task(robot).trainer_and_config(name, 123_456)
     assert (trainer.name, config.steps) == (name, 123_456)
-    assert training_task(robot).members[name] > 0
+    assert training_task(robot).usual_members(name) > 0
 
 
 @pytest.mark.parametrize(
