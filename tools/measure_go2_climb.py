@@ -7,7 +7,8 @@ The robots differ as in training (uniform domain randomisation, floor, payload, 
 stands at another distance before its platform. They are requested to walk ahead at 0.6 m/s for 6 s, behind
 the safety filter of deploying. A try succeeds if all four feet were on the platform at once and the robot did
 not fall. Distance and height are told, or with --blind not; the shipped walk, the default, takes neither. A
-row is one height and seed. Intervals are exact binomial ones of 95 %.
+row is one height and seed. Intervals are exact binomial ones of 95 %. `scuffs_per_try` is how often a leg
+came to press against the platform's front.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def measure(policy: Any, height: float, seed: int, tries: int, *, blind: bool) -
     """Return the row of one height.
 
     Args:
-        policy: The policy; one that observes no platform gets the walk's observation.
+        policy: The policy; it need not observe the platform.
         height: Of the platform [m].
         seed: Seeds the robots, their distances and the noise.
         tries: Number of robots.
@@ -37,15 +38,17 @@ def measure(policy: Any, height: float, seed: int, tries: int, *, blind: bool) -
     from scipy.stats import binomtest
 
     told = any(term.quantity == "obstacle" for term in policy.spec.observation)
-    done, fell = climbs(policy, udr_distribution("go2", "climb"), height, seed, tries, blind=blind)
-    interval = binomtest(done, tries).proportion_ci()
+    done = climbs(policy, udr_distribution("go2", "climb"), height, seed, tries, blind=blind)
+    interval = binomtest(done.climbed, tries).proportion_ci()
     return {
         "height_m": height,
         "seed": seed,
         "told": told and not blind,
         "tries": tries,
-        "climbed": done,
-        "fell": fell,
+        "climbed": done.climbed,
+        "fell": done.fell,
+        "scuffs_per_try": round(done.scuffs, 2),
+        "torque_rms_nm": round(done.torque_nm, 2),
         "interval": [round(float(interval.low), 3), round(float(interval.high), 3)],
         "error": "",
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -19,8 +20,8 @@ from deal_hw.motions.velocity import FixedVelocity, ScriptVelocity
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.climb_env import ClimbEnv, ClimbTask
 from deal_hw.policies.onnx_runtime import OnnxPolicy
-from deal_hw.policy import OBSTACLE_AXES
 from deal_hw.robots import recorded_description
+from deal_hw.sim.legged.terrain import Scuffs
 from deal_hw.workflows.emulation.virtual_go2 import walk
 from deal_hw.workflows.emulation.walk_script import WALKS, Walk, write_script
 
@@ -100,15 +101,20 @@ def score_canter(script: Walk, truth: Go2Truth, policy: OnnxPolicy, out: Path) -
 
 
 def score_climb(truth: Go2Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any]:
-    """Return the share of successful climbs, told and blind, and the number of falls, at each height."""
+    """Return the share of successful climbs, told and blind, and the number of falls, at each height.
+
+    Scuffs and torques (:class:`ClimbTries`) are means over the heights.
+    """
     space = walk_space()
     values = np.array([truth.walk_parameters()[name] for name in space.names])
     robot = ParameterDistribution.point(space, values, 1e-3 * truth.latency_ms)
     found: dict[str, Any] = {"climbed": {}, ENDED: 0}
     for name, blind in (("told", False), ("blind", True)):
         tries = [climbs(policy, robot, height, truth.seed, TRIES, blind=blind) for height in HEIGHTS_M]
-        found["climbed"][name] = [done for done, _ in tries]
-        found[ENDED] += sum(fell for _, fell in tries)
+        found["climbed"][name] = [one.climbed for one in tries]
+        found[ENDED] += sum(one.fell for one in tries)
+        found[f"scuffs_{name}"] = float(np.mean([one.scuffs for one in tries]))
+        found[f"torque_nm_{name}"] = float(np.mean([one.torque_nm for one in tries]))
     found["success"] = float(np.mean(list(found["climbed"].values()))) / TRIES
     return found
 
@@ -126,36 +132,59 @@ def climb_task(height: float, *, blind: bool) -> ClimbTask:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClimbTries:
+    """What became of tries to climb a platform.
+
+    Attributes:
+        climbed: Number of robots whose four feet were on the platform at once and that did not fall.
+        fell: Number of robots that fell.
+        scuffs: How often a leg or the trunk came to press against the platform's front, mean over the robots.
+        torque_nm: Root mean square of the joints' torques until the robots ended.
+    """
+
+    climbed: int
+    fell: int
+    scuffs: float
+    torque_nm: float
+
+
 def climbs(
     policy: Any, distribution: ParameterDistribution, height: float, seed: int, tries: int, *, blind: bool
-) -> tuple[int, int]:
+) -> ClimbTries:
     """Let robots climb in the batched environment, behind the safety filter of deploying.
 
-    A try succeeds if all four feet were on the platform at once and the robot did not fall.
-
     Args:
-        policy: The policy; one that observes no platform gets the walk's observation.
+        policy: The policy; it need not observe the platform.
         distribution: Of the robots.
         height: Of the platform [m].
         seed: Seeds the robots, their distances and the noise.
         tries: Number of robots.
         blind: Whether the robots are told nothing.
-
-    Returns:
-        How many climbed, and how many fell.
     """
     env = ClimbEnv(recorded_description("go2"), distribution, tries, task=climb_task(height, blind=blind))
-    told = any(term.quantity == "obstacle" for term in policy.spec.observation)
-    size = len(env.layout.observation) - (0 if told else len(OBSTACLE_AXES))
+    env.observe_for(policy.spec)
     seen, _ = env.reset(seed=seed)
     going, climbed = np.ones(tries, dtype=bool), np.zeros(tries, dtype=bool)
-    fell = np.zeros(tries, dtype=bool)
+    fell, pressing, scuffs = np.zeros(tries, dtype=bool), np.zeros(tries, dtype=bool), np.zeros(tries)
+    front, torque = Scuffs(env.loop.batch), env.loop.batch.engine.bind("actuator_force")
+    squares, ticks = 0.0, 0
     for _ in range(env.ticks):
-        seen, _, terminated, truncated, _ = env.step(policy.act_batch(seen[:, :size]))
+        seen, _, terminated, truncated, _ = env.step(policy.act_batch(seen))
         climbed |= going & (env.outcomes()["climbed"] > 0.0)
         fell |= going & terminated
         going &= ~(terminated | truncated)
-    return int((climbed & ~fell).sum()), int(fell.sum())
+        left = np.flatnonzero(going)
+        pressed = front.now(left)
+        scuffs[left] += pressed & ~pressing[left]
+        pressing[left] = pressed
+        squares, ticks = squares + float(np.square(torque[left]).mean(axis=1).sum()), ticks + len(left)
+    return ClimbTries(
+        climbed=int((climbed & ~fell).sum()),
+        fell=int(fell.sum()),
+        scuffs=float(scuffs.mean()),
+        torque_nm=float(np.sqrt(squares / max(ticks, 1))),
+    )
 
 
 TASKS: Final[Mapping[str, LoopTask]] = {

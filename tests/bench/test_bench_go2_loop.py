@@ -105,6 +105,7 @@ def test_the_walk_climbs_what_is_flat_and_no_wall(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(go2_tasks, "TRIES", 4)
     found = score_climb(draw_truth("realistic", 3), policy, tmp_path)
     assert found["climbed"]["told"][0] >= 2 and found["climbed"]["told"][1] == 0
+    assert all(found[f"scuffs_{name}"] > 0 and found[f"torque_nm_{name}"] > 0 for name in ("told", "blind"))
     assert found["success"] == sum(map(sum, found["climbed"].values())) / 16
 
 

@@ -15,6 +15,7 @@ from deal_hw.motions.obstacle import parse_obstacle
 from deal_hw.policies.climb_env import ClimbEnv, ClimbTask
 from deal_hw.policy import CLIMBED, ObservationBuilder
 from deal_hw.robots import recorded_description, training_task
+from deal_hw.sim.legged.terrain import Scuffs
 from deal_hw.workflows.running.plan import RunPlan, _ask_height, make_behaviour
 from deal_hw.workflows.running.view import RunView
 from deal_hw.workflows.train import nominal_distribution
@@ -44,6 +45,18 @@ def test_platforms_follow_the_levels_and_half_of_the_robots_are_told() -> None:
     np.testing.assert_allclose(seen[told, -1], env.platforms.rise[told], rtol=1e-6)
     np.testing.assert_allclose(seen[told, -2], env.platforms.distance[told], rtol=1e-6)
     assert not seen[~told, -2:].any()
+
+
+def test_a_leg_that_presses_against_the_front_scuffs() -> None:
+    """A front 1 cm ahead of a foot touches it; one 0.3 m ahead and the floor do not."""
+    env = make(3, flat=0.0, rise_m=(0.1, 0.1))
+    env.reset(seed=0)
+    env.step(np.zeros((3, 12)))
+    feet = np.asarray(env._places[:, env._feet[:2], 0]).max(axis=1)
+    env.platforms.place(np.arange(3), np.array([0.1, 0.1, 0.0]), feet + np.array([0.01, 0.3, 0.01]))
+    front = Scuffs(env.loop.batch)
+    np.testing.assert_array_equal(front.now(np.arange(3)), [True, False, False])
+    np.testing.assert_array_equal(front.now(np.array([2, 0])), [False, True])
 
 
 def test_the_commanded_way_is_taken_off_the_told_distance() -> None:

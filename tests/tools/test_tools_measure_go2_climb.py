@@ -30,6 +30,7 @@ def test_a_low_edge_is_taken_by_walking_and_not_by_standing(monkeypatch: pytest.
     row = measure_go2_climb.measure(walk, 0.02, 1, 6, blind=False)
     assert row["climbed"] >= 3 and row["tries"] == 6 and not row["told"]
     assert row["interval"][0] < row["climbed"] / 6 <= row["interval"][1]
+    assert row["scuffs_per_try"] > 0 and 2.0 < row["torque_rms_nm"] < 15.0
     monkeypatch.setattr(go2_tasks, "CLIMB_S", 1.0)
     still = measure_go2_climb.measure(Still(walk), 0.02, 1, 6, blind=True)
-    assert still["climbed"] == 0 and still["interval"][0] == 0.0
+    assert still["climbed"] == 0 and still["interval"][0] == 0.0 and still["scuffs_per_try"] == 0.0

@@ -7,6 +7,7 @@ hits a platform's edge must not pass through.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Any, Final, Literal, get_args
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.sim.engine.batch import ServoBatch
@@ -227,3 +229,36 @@ class BatchPlatforms:
         shape = (-1, *(1,) * (np.ndim(x) - 1))
         ahead = x - self.distance.reshape(shape)
         return np.where((ahead >= 0.0) & (ahead <= LENGTH_M), self.rise.reshape(shape), 0.0)
+
+
+class Scuffs:
+    """Which of N simulated robots press a leg against the front of their platform.
+
+    A contact of the platform with a leg or the trunk counts if its normal is less than 45 degrees from level.
+    Contacts are computed again from the coordinates, one robot after the other: this is for scores of some
+    hundred episodes, not for training.
+
+    Args:
+        batch: The robots; their model has a platform (:func:`with_terrain`).
+    """
+
+    def __init__(self, batch: ServoBatch) -> None:
+        self._model: Any = copy.copy(batch.robot.model)
+        self._data: Any = mujoco.MjData(self._model)
+        self._geoms = terrain_geoms(self._model)
+        self._position = batch.engine.bind("qpos")
+        self._fields = batch.engine.fields
+
+    def now(self, members: IntArray) -> npt.NDArray[np.bool_]:
+        """Return which of M members do, (M,)."""
+        model, data = self._model, self._data
+        places, found = self._fields.get("geom_pos"), np.zeros(len(members), dtype=bool)
+        for number, member in enumerate(members):
+            model.geom_pos[self._geoms] = places[member, self._geoms]
+            data.qpos[:] = self._position[member]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            contact = data.contact
+            ours = np.isin(contact.geom, self._geoms).any(axis=1)
+            found[number] = bool((np.abs(contact.frame[ours, 2]) < math.sqrt(0.5)).any())
+        return found
