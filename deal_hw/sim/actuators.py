@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.engine.batch import COMMAND_DELAY, ENCODER_BIAS, ENCODER_SCALE, command_laws
+from deal_hw.sim.engine.batch import COMMAND_DELAY, command_laws
 from deal_hw.sim.engine.model import command_scale, drop_filters, filters_of
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.laws.setpoints import delay, slew
@@ -28,6 +28,7 @@ from deal_hw.sim.mjcf.calibrated import LATENCY_NUMERIC, custom_name
 from deal_hw.sim.parameters import DEVICE_KINDS, KIND_TABLE
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
+from deal_hw.sim.parameters.sensor import ENCODER_BIAS, ENCODER_SCALE
 from deal_hw.sim.parameters.values import spread
 from deal_hw.types import FloatArray
 
@@ -100,8 +101,8 @@ class ActuatorLaws:
         read = (acting[0, 0] - self._bias[joint]) / self._scale[joint]
         self._data.ctrl[:] = np.where(self._servo, read, acting[0, 0]) / self._per_ctrl
         if self._laws is not None:
-            if not self._began and self._laws.loaded:
-                mujoco.mj_forward(self._model, self._data)
+            if not self._began:
+                self._laws.begin(lambda: mujoco.mj_forward(self._model, self._data))
             self._laws.write()
         self._began = True
         mujoco.mj_step(self._model, self._data)

@@ -44,6 +44,8 @@ def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> Flo
     [
         {"dof_friction_stribeck": 0.2, "dof_stribeck_speed": 0.3, "command_lag": 0.02},
         {"dof_friction_load": 0.1, "servo_play": 0.03, "motor_free_speed": 2.5},
+        {"servo_dead_zone": 0.02, "servo_punch": 0.1, "dof_friction_load": 0.1, "encoder_scale": 1.1},
+        {"servo_resolution": 0.01, "servo_speed_limit": 1.0, "encoder_bias": 0.05},
         {"servo_speed_limit": 1.0, "command_delay": 0.005, "encoder_scale": 1.1, "encoder_bias": 0.05},
     ],
     ids="+".join,

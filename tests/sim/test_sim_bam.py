@@ -131,16 +131,20 @@ def test_what_other_programs_lose_stands_in_their_tables(tmp_path: Path) -> None
         '<position name="shoulder" joint="shoulder" kp="20" kv="1"',
         '<general name="shoulder" joint="shoulder" gainprm="20" biastype="affine" biasprm=".3 -20 -1"',
     )
-    result = result_of({"motor_free_speed": 6.0, "dof_friction_load": 0.04, "command_lag": 0.02})
+    laws = {"dof_friction_load": 0.04, "command_lag": 0.02, "servo_dead_zone": 0.01}
+    result = result_of({"motor_free_speed": 6.0, **laws})
     table = actuator_tables(robot(tmp_path, text), result)
     for place in ("isaac_lab", "mjlab", "isaac_lab_motors", "mjlab_motors"):
         lost = table[place]["cannot_express"]
         assert "shoulder.dof_friction_load = 0.04 - (dof_friction_load)" in lost
         assert "shoulder.command_lag = 0.02 - (command_lag)" in lost
+        assert "shoulder.servo_dead_zone = 0.01 - (servo_dead_zone)" in lost
         assert "elbow: lag of 0.05 s of its command, the filter of the MJCF" in lost
         assert any(line.startswith("shoulder: constant effort of 0.3") for line in lost)
         assert any("motor_free_speed" in line for line in lost) is not place.endswith("_motors")
-    assert laws_without_a_field(result) == ["shoulder.dof_friction_load", "shoulder.command_lag"]
+    assert laws_without_a_field(result) == [f"shoulder.{kind}" for kind in laws]
+    bam = bam_parameters(robot(tmp_path, SERVO), result)["joints"]["shoulder"]["cannot_express"]
+    assert "shoulder.servo_dead_zone = 0.01 - (servo_dead_zone)" in bam
     (isaac,) = table["isaac_lab_motors"]["actuators"]
     assert isaac["saturation_effort"] == isaac["effort_limit"] == 4.0 and isaac["velocity_limit"] == 6.0
     assert isaac["stiffness"] == 24.0 and isaac["damping"] == pytest.approx(1.05)

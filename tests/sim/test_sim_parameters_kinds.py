@@ -23,7 +23,7 @@ from deal_hw.sim.parameters import (
 )
 from deal_hw.sim.parameters.fields import BatchFields, ModelFields
 from deal_hw.sim.parameters.geom import bounce, damping_ratio, restitution_of
-from deal_hw.sim.parameters.laws import FRICTION_KINDS
+from deal_hw.sim.parameters.laws import FRICTION_KINDS, SERVO_LAW_KINDS
 
 MJCF = """
 <mujoco>
@@ -346,6 +346,7 @@ def test_unknown_kind_names_the_nearest() -> None:
         "motor_free_speed",
         *COMMAND_KINDS,
         *FRICTION_KINDS,
+        *SERVO_LAW_KINDS,
         "effort_gain",
         "effort_bias",
         "effort_delay",

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from fakes.law_robots import MOTOR, SERVO, known, swing
+from fakes.law_robots import GEARED, MOTOR, SERVO, known, swing
 from fakes.law_robots import robot as robot_of
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
@@ -182,6 +182,17 @@ def servo_armature(model: RobotModel) -> Parameter:
         ),
         (SERVO, [("dof_friction_stribeck", "elbow", 0.2)]),
         (MOTOR, [("motor_free_speed", "wheel", 4.0)]),
+        (SERVO, [("servo_dead_zone", "shoulder", 0.02), ("dof_friction_load", "shoulder", 0.1)]),
+        (
+            GEARED,
+            [
+                ("servo_dead_zone", "shoulder", 0.02),
+                ("servo_punch", "shoulder", 0.2),
+                ("servo_resolution", "shoulder", 0.01),
+                ("encoder_scale", "shoulder", 1.2),
+                ("encoder_bias", "shoulder", 0.05),
+            ],
+        ),
     ],
 )
 def test_laws_between_steps_agree(tmp_path: Path, text: str, parameters: list[Any]) -> None:

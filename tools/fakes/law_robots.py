@@ -1,4 +1,4 @@
-"""Two small robots for tests of laws, and batches of them with known parameters."""
+"""Three small robots for tests of laws, and batches of them with known parameters."""
 
 from __future__ import annotations
 
@@ -30,6 +30,16 @@ MOTOR = """
 </worldbody><actuator>
 <motor name="wheel" joint="wheel" gear="2" ctrlrange="-1 1" forcerange="-.5 .5"/></actuator>
 </mujoco>"""
+
+GEARED = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body><joint name="shoulder" axis="0 1 0" damping="0.3" frictionloss="0.05" armature="0.01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4"/></body>
+</worldbody><actuator>
+<general name="shoulder" joint="shoulder" gear="-2" ctrlrange="-1 .8" forcerange="-1.5 1.5" gainprm="3"
+ biastype="affine" biasprm=".1 -6"/>
+</actuator></mujoco>"""
+"""A servo behind a gear that turns the other way; its set-point is scaled and limited, an effort constant."""
 
 
 def robot(tmp_path: Path, text: str) -> RobotModel:

@@ -26,14 +26,9 @@ from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.laws.commands import NEUTRAL, CommandLaws, Filters
 from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
+from deal_hw.sim.parameters.sensor import ENCODER_BIAS, ENCODER_SCALE
 from deal_hw.sim.parameters.values import KindValues, spread, values_by_kind
 from deal_hw.types import FloatArray
-
-ENCODER_BIAS = "encoder_bias"
-"""Kind of parameter without a MuJoCo field: reported joint position at a true one of 0."""
-
-ENCODER_SCALE = "encoder_scale"
-"""Kind of parameter without a MuJoCo field: reported over true change of a joint position."""
 
 COMMAND_DELAY = "command_delay"
 """Kind of parameter without a MuJoCo field: delay of an actuator's commands, in addition to the latency."""
@@ -275,7 +270,7 @@ class ServoBatch:
         force[:, actuator[limited], 0] = -limit[:, limited]
         force[:, actuator[limited], 1] = limit[:, limited]
         if self._steps is not None:
-            self._steps.read_limits()
+            self._steps.read_sent()
 
     def set_state(
         self,

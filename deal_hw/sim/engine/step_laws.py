@@ -1,8 +1,8 @@
-"""Laws of joints that act between the engine's steps: friction by speed and load, effort by speed.
+"""Laws that act between the engine's steps: friction by speed and load, effort by speed, servos' firmware.
 
-Before each step friction and effort limits are written into the model's fields, from the speeds at the
-beginning of the step and the torques during the step before. MuJoCo solves friction as a constraint, so a
-joint that friction holds stays at rest, with any step.
+Before each step friction, effort limits and constant efforts are written into the model's fields, from the
+state at the beginning of the step and the torques during the step before. MuJoCo solves friction as a
+constraint, so a joint that friction holds stays at rest, with any step.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from deal_hw.sim.engine.servo_firmware import ServoFirmware
 from deal_hw.sim.laws.friction import FrictionLaw
 from deal_hw.sim.laws.motor import effort_range
-from deal_hw.sim.parameters.fields import Fields, element_id
+from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
 from deal_hw.sim.parameters.laws import FREE_SPEED, FRICTION_KINDS, STRIBECK_SPEED
 from deal_hw.sim.parameters.values import KindValues
 from deal_hw.types import FloatArray, IntArray
@@ -39,6 +40,10 @@ class StepLaws:
         friction: Their law; its Coulomb part is that of the fields.
         actuator: Actuators with a speed without load, B of them.
         free_speed: These speeds, (N, B) [rad/s or m/s].
+        firmware: What servos make of the errors of their positions; None for servos without such a law.
+
+    Attributes:
+        firmware: The same.
     """
 
     def __init__(
@@ -49,11 +54,12 @@ class StepLaws:
         friction: dict[str, FloatArray],
         actuator: list[int],
         free_speed: FloatArray,
+        firmware: ServoFirmware | None = None,
     ) -> None:
         model = self._model = fields.model
         driven = [int(model.jnt_dofadr[model.actuator_trnid[a, 0]]) for a in actuator]
-        self._dof, self._actuator, self._driven = _index(dof), _index(actuator), _index(driven)
-        self._free_speed = free_speed
+        self._dof, self._actuator, self._driven = as_slice(dof), as_slice(actuator), as_slice(driven)
+        self._free_speed, self.firmware = free_speed, firmware
         # An actuator behind a negative gear turns the other way than its joint.
         self._turns = np.sign(model.actuator_gear[actuator, 0])
         self._friction: FrictionLaw | None = None
@@ -63,7 +69,7 @@ class StepLaws:
         self._limited = bool(actuator)
         if self._limited:
             self._range = fields.get("actuator_forcerange")
-            self.read_limits()
+            self._read_limits()
         self._qvel = outputs("qvel")
         if self.loaded:
             # Outputs that are bound are copied after every step.
@@ -79,14 +85,16 @@ class StepLaws:
                 dof = int(model.jnt_dofadr[element_id(model, "joint", joint)])
                 found.setdefault(dof, {}).update(dict.fromkeys(coefficients, value))
         free = {element_id(model, "actuator", name): value for name, value in values.get(FREE_SPEED, ())}
-        if not found and not free:
+        firmware = ServoFirmware.of(fields, outputs, values)
+        if not found and not free and firmware is None:
             return None
         count = len(outputs("qvel"))
         friction = {
             name: _columns([law.get(name, np.full(count, neutral)) for law in found.values()], count)
             for name, neutral in COEFFICIENTS.items()
         }
-        return cls(fields, outputs, list(found), friction, list(free), _columns(list(free.values()), count))
+        speeds = _columns(list(free.values()), count)
+        return cls(fields, outputs, list(found), friction, list(free), speeds, firmware)
 
     @property
     def friction(self) -> FrictionLaw | None:
@@ -110,6 +118,16 @@ class StepLaws:
         return actuator, dof, self._turns, self._stall, self._free_speed
 
     @property
+    def written(self) -> set[str]:
+        """Names of the model fields that the laws write."""
+        parts = {
+            "dof_frictionloss": self._friction is not None,
+            "actuator_forcerange": self._limited,
+            "actuator_biasprm": self.firmware is not None,
+        }
+        return {name for name, writes in parts.items() if writes}
+
+    @property
     def loaded(self) -> bool:
         """Whether any friction depends on a load, so that the torques of the step before count."""
         return self._friction is not None and self._friction.loaded
@@ -120,6 +138,8 @@ class StepLaws:
             self._loss[:, self._dof] = self._model.dof_frictionloss[self._dof]
         if self._limited:
             self._range[:, self._actuator] = self._model.actuator_forcerange[self._actuator]
+        if self.firmware is not None:
+            self.firmware.restore()
 
     def restore_limits(self) -> None:
         """Write the effort limits at standstill where the law has written."""
@@ -127,13 +147,30 @@ class StepLaws:
             self._range[:, self._actuator, 0] = -self._stall
             self._range[:, self._actuator, 1] = self._stall
 
-    def read_limits(self) -> None:
-        """Take the effort limits in the fields as those at standstill."""
+    def read_sent(self) -> None:
+        """Take effort limits in the fields as those at standstill, and gains of servos as those that act."""
         if self._limited:
-            self._stall = self._range[:, self._actuator, 1].copy()
+            self._read_limits()
+        if self.firmware is not None:
+            self.firmware.read_gains()
+
+    def _read_limits(self) -> None:
+        self._stall = self._range[:, self._actuator, 1].copy()
+
+    def begin(self, forward: Callable[[], None]) -> None:
+        """Compute what laws take from the step before, where there was none: that of this state.
+
+        Args:
+            forward: Computes the torques of all simulations.
+        """
+        if not self.loaded:
+            return
+        if self.firmware is not None:
+            self.firmware.write()
+        forward()
 
     def write(self) -> None:
-        """Write friction and limits for the next step."""
+        """Write friction, limits and the servos' efforts for the next step, whose controls are set."""
         if self._friction is not None:
             dof, law = self._dof, self._friction
             if law.loaded:
@@ -144,6 +181,8 @@ class StepLaws:
         if self._limited:
             low, high = effort_range(self._qvel[:, self._driven] * self._turns, self._stall, self._free_speed)
             self._range[:, self._actuator, 0], self._range[:, self._actuator, 1] = low, high
+        if self.firmware is not None:
+            self.firmware.write()
 
 
 def rollout(
@@ -167,26 +206,17 @@ def rollout(
     ctrl, applied = batch.bind("ctrl"), batch.bind("qfrc_applied")
     nu = ctrl.shape[1]
     pushed = bool(spec & int(mujoco.mjtState.mjSTATE_QFRC_APPLIED))
-    # No step came before: torques are those of this state.
     ctrl[:] = control[:, 0, :nu]
-    if laws.loaded:
-        batch.forward()
+    laws.begin(batch.forward)
     for step in range(steps):
-        laws.write()
         ctrl[:] = control[:, step, :nu]
+        laws.write()
         if pushed:
             applied[:] = control[:, step, nu:]
         batch.step()
         for name, field in fields.items():
             record[name][:, step] = field
     return record
-
-
-def _index(numbers: list[int]) -> slice | list[int]:
-    """Return numbers as a slice where they follow each other: a view costs less than a copy in each step."""
-    if numbers and numbers == list(range(numbers[0], numbers[0] + len(numbers))):
-        return slice(numbers[0], numbers[0] + len(numbers))
-    return numbers
 
 
 def _columns(values: list[FloatArray], count: int) -> FloatArray:

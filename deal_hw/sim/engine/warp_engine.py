@@ -22,6 +22,7 @@ from deal_hw.errors import CalibrationError, ConfigurationError, short
 from deal_hw.sim.engine.engines import Mask, MujocoEngine, State
 from deal_hw.sim.engine.step_laws import LEAST_FRICTION, StepLaws
 from deal_hw.sim.engine.warp_support import check_gpu, check_installed, check_model
+from deal_hw.sim.laws.servo import MARGIN
 from deal_hw.sim.parameters.fields import Array, Fields
 from deal_hw.types import FloatArray
 
@@ -280,7 +281,7 @@ class _Worlds:
 
     def put_fields(self, fields: Any, laws: StepLaws | None) -> None:
         """Copy the members' fields that may have changed; those that laws write get one row a world."""
-        written = {"dof_frictionloss", "actuator_forcerange"} if laws is not None else set()
+        written = laws.written if laws is not None else set()
         names = fields.changed | (written & fields.seen)
         if self._fresh:
             self._fresh, names = False, fields.seen | set(DERIVED)
@@ -358,6 +359,7 @@ class _Worlds:
             if laws is not None and laws.loaded:
                 # No step came before: torques are those of this state.
                 self._set_control()
+                self._write_efforts()
                 self._mjw.forward(self._model, self._data)
             if wp.get_device(self._device).is_cuda and steps > 1:
                 self._run_graph(steps)
@@ -404,11 +406,20 @@ class _Worlds:
         inputs = [self._step, self._control, self._nu, self._data.ctrl, self._data.qfrc_applied]
         self._wp.launch(kernels.set_control, dim=(self.count, self._control.shape[3]), inputs=inputs)
 
+    def _write_efforts(self) -> None:
+        from deal_hw.sim.engine import warp_kernels as kernels
+
+        if parts := self._laws.get("firmware"):
+            state = [self._data.ctrl, self._data.qpos, self._model.actuator_biasprm]
+            inputs = [self._members, *parts, MARGIN, *state]
+            self._wp.launch(kernels.servo_efforts, dim=(self.count, parts[0].shape[0]), inputs=inputs)
+
     def _launch(self) -> None:
         """Launch the kernels of one step, with what is around it."""
         from deal_hw.sim.engine import warp_kernels as kernels
 
         model, data, launch = self._model, self._data, self._wp.launch
+        self._set_control()
         if parts := self._laws.get("friction"):
             state = [data.qvel, data.qfrc_actuator, data.qfrc_bias, model.dof_frictionloss]
             inputs = [self._members, *parts, self._loaded, LEAST_FRICTION, *state]
@@ -416,7 +427,7 @@ class _Worlds:
         if parts := self._laws.get("limits"):
             inputs = [self._members, *parts, data.qvel, model.actuator_forcerange]
             launch(kernels.effort_limits, dim=(self.count, parts[0].shape[0]), inputs=inputs)
-        self._set_control()
+        self._write_efforts()
         self._mjw.step(model, data)
         for name, (every, out) in self._records.items():
             shape = out.shape[1:]
@@ -462,6 +473,12 @@ def _law_values(laws: StepLaws) -> dict[str, list[npt.NDArray[Any]]]:
         actuator, dof, *values = limits
         numbers = [np.ascontiguousarray(part, dtype=np.float32) for part in values]
         found["limits"] = [actuator.astype(np.int32), dof.astype(np.int32), *numbers]
+    if (servos := laws.firmware) is not None:
+        part = servos.law
+        each = [servos.gear, servos.per_ctrl, servos.offset, *servos.control_range]
+        every = [part.resolution, part.dead_zone, part.punch, part.scale, part.bias]
+        places = [servos.actuator.astype(np.int32), servos.place.astype(np.int32)]
+        found["firmware"] = [*places, *(np.stack(group).astype(np.float32) for group in (each, every))]
     return found
 
 

@@ -5,6 +5,9 @@ A world is a member in a window: world ``g N + n`` is member n of N in window g.
 
 import warp as wp
 
+vec10 = wp.types.vector(length=10, dtype=float)
+"""Parameters of an actuator's gain or bias."""
+
 
 @wp.kernel
 def set_control(
@@ -69,6 +72,49 @@ def effort_limits(
     most = stall[n, b]
     lost = most * (qvel[w, driven[b]] * turns[b] / free_speed[n, b])
     limit[w, actuator[b]] = wp.vec2(-most - lost, most - lost)
+
+
+@wp.func
+def counted(reading: float, count: float) -> float:
+    """Return a reading in whole counts; as it is without any."""
+    whole = reading
+    if count > 0.0:
+        whole = wp.rint(reading / count) * count
+    return whole
+
+
+@wp.kernel
+def servo_efforts(
+    members: int,
+    actuator: wp.array[int],
+    place: wp.array[int],
+    servo: wp.array2d[float],
+    law: wp.array3d[float],
+    margin: float,
+    ctrl: wp.array2d[float],
+    qpos: wp.array2d[float],
+    bias: wp.array2d[vec10],
+) -> None:
+    """Write the constant efforts of :class:`deal_hw.sim.engine.servo_firmware.ServoFirmware`.
+
+    ``servo`` has gear, goal at a ``ctrl`` of 1, own constant effort and both ends of ``ctrl``, (5, B).
+    ``law`` has the parts of `ServoLaw`, (5, N, B).
+    """
+    w, b = wp.tid()
+    n = w % members
+    a = actuator[b]
+    gear = servo[0, b]
+    gain = -bias[w, a][1]
+    goal = wp.clamp(ctrl[w, a], servo[3, b], servo[4, b]) * servo[1, b]
+    position = qpos[w, place[b]]
+    scale = law[3, n, b]
+    read = counted(scale * position + law[4, n, b], law[0, n, b])
+    error = counted(scale * goal + law[4, n, b], law[0, n, b]) - read
+    beyond = wp.abs(error) - law[1, n, b]
+    acting = 0.0
+    if beyond > margin:
+        acting = wp.sign(error) * (beyond / scale + law[2, n, b] / (gain * gear * gear))
+    bias[w, a][0] = servo[2, b] + gain * gear * (acting - (goal - position))
 
 
 @wp.kernel

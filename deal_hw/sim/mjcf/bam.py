@@ -19,7 +19,7 @@ from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.model import RobotModel, model_with
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.drive import JointDrive, drive_of
-from deal_hw.sim.parameters.laws import FREE_SPEED, FRICTION_KINDS, LAW_KINDS, STRIBECK_SPEED
+from deal_hw.sim.parameters.laws import FREE_SPEED, FRICTION_KINDS, STRIBECK_SPEED
 
 BAM = "bam.json"
 """Name of the file in a result's folder."""
@@ -30,7 +30,8 @@ EXPONENT = 2.0
 """BAM's alpha in our law of Stribeck friction."""
 
 _KINDS = (
-    *(kind.name for kind in LAW_KINDS),
+    *FRICTION_KINDS,
+    FREE_SPEED,
     "servo_stiffness",
     "servo_damping",
     "servo_effort_limit",

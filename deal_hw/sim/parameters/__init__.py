@@ -23,7 +23,7 @@ from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
 from deal_hw.sim.parameters.inertia import INERTIA_KINDS
 from deal_hw.sim.parameters.joint import JOINT_KINDS
 from deal_hw.sim.parameters.kind import Apply, Kind, Together
-from deal_hw.sim.parameters.laws import LAW_KINDS, check_laws
+from deal_hw.sim.parameters.laws import LAW_KINDS, SERVO_RESOLUTION, check_laws
 from deal_hw.sim.parameters.sensor import SENSOR_KINDS
 from deal_hw.sim.parameters.tendon import TENDON_KINDS
 
@@ -151,6 +151,11 @@ def _check_searchable(p: Parameter) -> None:
             f"parameter {p.name!r}: noise of a sensor changes no prediction, so no search can find it; "
             "leave it out (it is estimated from the recording) or give the value you measured, "
             f"`known: {p.nominal:g}`"
+        )
+    if p.kind == SERVO_RESOLUTION and not p.known:
+        raise ConfigurationError(
+            f"parameter {p.name!r}: motion follows the counts of an encoder in jumps, so no search can find "
+            "their size; give that of the data sheet, `known: 0.001534` for 4096 counts a turn"
         )
 
 

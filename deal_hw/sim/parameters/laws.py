@@ -1,4 +1,4 @@
-"""Parameter kinds of laws that no MuJoCo field holds: friction by speed and load, effort by speed.
+"""Parameter kinds of laws that no MuJoCo field holds: friction, effort by speed, servos' firmware.
 
 Their equations are in :mod:`deal_hw.sim.laws`.
 """
@@ -9,8 +9,11 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+import mujoco
+
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.kind import FRICTION_RATIO, Kind, joint_of, one_dof_joint
 
 STRIBECK_SPEED = 0.1
@@ -33,6 +36,16 @@ FRICTION_KINDS: Mapping[str, Sequence[str]] = MappingProxyType(
     }
 )
 """Kinds that are laws of friction, and the coefficients of `FrictionLaw` that they set."""
+
+SERVO_RESOLUTION = "servo_resolution"
+
+SERVO_LAW_KINDS: Mapping[str, str] = MappingProxyType(
+    {SERVO_RESOLUTION: "resolution", "servo_dead_zone": "dead_zone", "servo_punch": "punch"}
+)
+"""Kinds that are laws of a servo's firmware, and the parts of `ServoLaw` that they set."""
+
+_INTEGRATORS = ("Euler", "implicit", "implicitfast")
+"""Integrators that hold a servo's effort against its position for a whole step."""
 
 
 def _friction(name: str, *, quantity: str, unit: str, slide: str, along: str) -> Kind:
@@ -58,6 +71,20 @@ def _limited(model: Any, actuator: int, name: str) -> None:
         raise ConfigurationError(
             f"actuator {name!r} has no effort limit that could fall with speed; give it a `forcerange` in "
             "the MJCF, its effort at standstill to both sides"
+        )
+
+
+def _error_known(model: Any, actuator: int, name: str) -> None:
+    if drive_of(model, actuator, name).takes != "position":
+        raise ConfigurationError(
+            f"actuator {name!r} is no position servo, so it compares no position with a goal; for a motor "
+            "use command_dead_zone"
+        )
+    used = mujoco.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_")
+    if used not in {name.upper() for name in _INTEGRATORS}:
+        raise ConfigurationError(
+            f"the integrator {used} changes the effort of a servo within a step, and its firmware does not; "
+            f'write <option integrator="..."/> with one of {", ".join(_INTEGRATORS)}'
         )
 
 
@@ -148,5 +175,45 @@ LAW_KINDS = (
         apply=None,
         baseline=None,
         usable=_limited,
+    ),
+    Kind(
+        name=SERVO_RESOLUTION,
+        element="actuator",
+        quantity="servo_resolution",
+        unit="rad",
+        unit_slide="m",
+        writes=(),
+        along="goal and reading are compared in steps of it, the encoder's counts; `known` only",
+        apply=None,
+        baseline=None,
+        usable=_error_known,
+    ),
+    Kind(
+        name="servo_dead_zone",
+        element="actuator",
+        quantity="servo_dead_zone",
+        unit="rad",
+        unit_slide="m",
+        writes=(),
+        along="errors of the position up to this size have no effort, larger ones lose it",
+        apply=None,
+        baseline=lambda m, i: 0.0,
+        usable=_error_known,
+        scale="linear",
+        spread=0.03,
+    ),
+    Kind(
+        name="servo_punch",
+        element="actuator",
+        quantity="servo_punch",
+        unit="N·m",
+        unit_slide="N",
+        writes=(),
+        along="effort that a servo begins with just beyond its dead zone",
+        apply=None,
+        baseline=lambda m, i: 0.0,
+        usable=_error_known,
+        scale="linear",
+        spread=0.3,
     ),
 )

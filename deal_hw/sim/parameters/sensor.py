@@ -8,9 +8,15 @@ from __future__ import annotations
 
 from deal_hw.sim.parameters.kind import Kind, one_dof_joint
 
+ENCODER_BIAS = "encoder_bias"
+"""Kind of parameter without a MuJoCo field: reported joint position at a true one of 0."""
+
+ENCODER_SCALE = "encoder_scale"
+"""Kind of parameter without a MuJoCo field: reported over true change of a joint position."""
+
 SENSOR_KINDS = (
     Kind(
-        name="encoder_bias",
+        name=ENCODER_BIAS,
         element="joint",
         quantity="encoder_bias",
         unit="rad",
@@ -25,7 +31,7 @@ SENSOR_KINDS = (
         least=float("-inf"),
     ),
     Kind(
-        name="encoder_scale",
+        name=ENCODER_SCALE,
         element="joint",
         quantity="encoder_scale",
         unit="-",
