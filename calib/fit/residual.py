@@ -27,6 +27,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.calib.fit.command_delays import with_command_delays
+from deal_hw.sim.parameters.laws import SERVO_RESOLUTION
 from deal_hw.types import FloatArray
 
 PARAMETER_STEP = 1e-4
@@ -35,6 +36,10 @@ PARAMETER_STEP = 1e-4
 CONTACT_PARAMETER_STEP = 2e-2
 """The same with feet on the floor. Sticking and slipping make kinks on every scale, and a secant describes
 them better than a derivative."""
+
+COUNTED_PARAMETER_STEP = 2e-2
+"""The same where servos read their joints in counts. The motion follows these in jumps: a smaller step passes
+too few of them, and its effect is chance."""
 
 NOISE_FREE_PARAMETER_STEP = 1e-5
 """The same for noise-free states, where no noise hides a secant's error."""
@@ -174,6 +179,8 @@ class Shooting:
         self.start_information = [1 / d.prior_std**2 for d in self.data]
         self._parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
+        if any(p.kind == SERVO_RESOLUTION for p in problem.space.parameters):
+            self._parameter_step = COUNTED_PARAMETER_STEP
         if self.contacts:
             self._parameter_step = CONTACT_PARAMETER_STEP
             self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -43,6 +43,8 @@ LAWS: Mapping[str, tuple[str, float, tuple[float, float]]] = {
     "asymmetry": ("command_asymmetry", 0.15, (-0.4, 0.4)),
     "dead_zone": ("command_dead_zone", 0.05, (0.0, 0.3)),
     "encoder_scale": ("encoder_scale", 1.2, (0.5, 2.0)),
+    "servo_dead_zone": ("servo_dead_zone", 0.02, (0.0, 0.2)),
+    "servo_punch": ("servo_punch", 0.3, (0.0, 2.0)),
 }
 """Laws by the last part of their names: kind, true value, range."""
 
@@ -80,7 +82,8 @@ def recording(actuator: str, true: Mapping[str, float], seed: int) -> dict[str, 
         if "free_speed" in true:
             lost = stall * speed / true["free_speed"]
             model.actuator_forcerange[0] = -stall - lost, stall - lost
-        data.ctrl[0] = acting
+        at = float(data.qpos[0])
+        data.ctrl[0] = acting if actuator == MOTOR else at + servo_error(acting, at, true)
         if step == 0:
             mujoco.mj_forward(model, data)
         mujoco.mj_step(model, data)
@@ -88,8 +91,31 @@ def recording(actuator: str, true: Mapping[str, float], seed: int) -> dict[str, 
     return {"time": time, "shoulder": noisy, "shoulder.command": command}
 
 
-def recovered(tmp_path: Path, actuator: str, laws: Mapping[str, float]) -> dict[str, float]:
-    """Return fitted values over true ones; the fit begins at three times or a third of a law's value."""
+def servo_error(goal: float, position: float, true: Mapping[str, float]) -> float:
+    """Return the error that acts at 25 N·m/rad."""
+    zone, punch = true.get("servo_dead_zone", 0.0), true.get("servo_punch", 0.0)
+    count = true.get("servo_resolution")
+    error = goal - position if count is None else (round(goal / count) - round(position / count)) * count
+    return math.copysign(abs(error) - zone + punch / 25, error) if abs(error) > zone else 0.0
+
+
+def recovered(
+    tmp_path: Path,
+    actuator: str,
+    laws: Mapping[str, float],
+    given: Mapping[str, float] | None = None,
+    others: Sequence[str] = (),
+) -> dict[str, float]:
+    """Return fitted values over true ones; the fit begins at twice or half of a law's value.
+
+    Args:
+        tmp_path: Folder of the model and its parameters.
+        actuator: The actuator.
+        laws: Its laws, which are searched.
+        given: Its laws that are known.
+        others: Entries of further parameters, whose values are returned as they are.
+    """
+    given = given or {}
     model = tmp_path / "arm.xml"
     model.write_text(ARM.format(actuator=actuator))
     lines = ["parameters:", *(f"  - {{kind: {kind}, elements: shoulder}}" for kind, _, _ in COMMON.values())]
@@ -99,13 +125,14 @@ def recovered(tmp_path: Path, actuator: str, laws: Mapping[str, float]) -> dict[
         scale = "linear" if low <= 0 else "log"
         ends = f"range: [{low}, {high}], scale: {scale}"
         lines.append(f"  - {{kind: {kind}, elements: shoulder, nominal: {first}, {ends}}}")
-    (tmp_path / "params.yaml").write_text("\n".join(lines) + "\n")
+    lines += [f"  - {{kind: {name}, elements: shoulder, known: {value}}}" for name, value in given.items()]
+    (tmp_path / "params.yaml").write_text("\n".join([*lines, *others]) + "\n")
     columns = tmp_path / "columns.yaml"
     columns.write_text(COLUMNS + (", target_unit: Nm}\n" if actuator == MOTOR else "}\n"))
     work = calibration_input(
         FilesSettings(
             model=model,
-            data=[recording(actuator, laws, 1)],
+            data=[recording(actuator, {**laws, **given}, 1)],
             columns=columns,
             parameters=tmp_path / "params.yaml",
             holdout_part=0.0,
@@ -116,7 +143,9 @@ def recovered(tmp_path: Path, actuator: str, laws: Mapping[str, float]) -> dict[
     fit = refine(problem, problem.space.nominal, 0.0)
     true = {f"shoulder.{name}": value for name, value in laws.items()}
     true |= {f"shoulder.{name}": value for name, (_, _, value) in COMMON.items()}
-    return {name: float(v) / true[name] for name, v in zip(problem.space.names, fit.theta, strict=True)}
+    return {
+        name: float(v) / true.get(name, 1.0) for name, v in zip(problem.space.names, fit.theta, strict=True)
+    }
 
 
 def slow(actuator: str, names: list[str]) -> ParameterSet:
@@ -131,6 +160,8 @@ def slow(actuator: str, names: list[str]) -> ParameterSet:
         (SERVO, ["friction_load"]),
         (SERVO, ["free_speed"]),
         (SERVO, ["lag"]),
+        (SERVO, ["servo_dead_zone"]),
+        slow(SERVO, ["servo_punch"]),
         (MOTOR, ["asymmetry"]),
         (MOTOR, ["dead_zone"]),
         (MOTOR, ["encoder_scale"]),
@@ -145,3 +176,25 @@ def test_laws_are_recovered(tmp_path: Path, actuator: str, names: list[str]) -> 
     """Each law, and pairs, to 5 % with damping and dry friction to 5 %, at a noise of 0.1 mrad."""
     found = recovered(tmp_path, actuator, {name: LAWS[name][1] for name in names})
     assert found == pytest.approx(dict.fromkeys(found, 1.0), rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_servo_that_reads_counts_is_fitted(tmp_path: Path) -> None:
+    """4096 counts a turn and a dead zone of one: damping, friction and punch to 5 %."""
+    count = 2 * math.pi / 4096
+    given = {"servo_resolution": count, "servo_dead_zone": count}
+    found = recovered(tmp_path, SERVO, {"servo_punch": LAWS["servo_punch"][1]}, given)
+    assert found == pytest.approx(dict.fromkeys(found, 1.0), rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_dead_zone_is_no_play_and_no_stiffness(tmp_path: Path) -> None:
+    """All are searched, and dry friction: the zone has its value, the play none."""
+    others = [
+        "  - {kind: servo_play, elements: shoulder, nominal: 0.01, range: [0, 0.2]}",
+        "  - {kind: servo_stiffness, elements: shoulder, nominal: 20, ratio: 3}",
+    ]
+    found = recovered(tmp_path, SERVO, {"servo_dead_zone": LAWS["servo_dead_zone"][1]}, others=others)
+    assert found.pop("shoulder.play") < 1e-4
+    assert found.pop("shoulder.servo_stiffness") == pytest.approx(25.0, rel=0.02)
+    assert found == pytest.approx(dict.fromkeys(found, 1.0), rel=0.02)
