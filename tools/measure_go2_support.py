@@ -1,4 +1,4 @@
-"""Measure the signals that distinguish floor and stand, for ``deal_hw.drivers.go2.support``.
+"""Measure the signals that distinguish floor and stand, for ``deal_hw.drivers.unitree.support``.
 
     python tools/measure_go2_support.py --out docs/measured/go2_support.json
 
@@ -12,12 +12,12 @@ import itertools
 import numpy as np
 from measuring import Rows, line, markdown, parser
 
-from deal_hw.drivers.go2.descriptions.leg_geometry import foot_loads, foot_positions
+from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY, SUPPORT
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
-from deal_hw.drivers.go2.support import read_support
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.support import read_support
 
 SITUATIONS = {
     "lying, limp": {"sport": ""},
@@ -50,15 +50,21 @@ def main() -> None:
         rows, answers = [], set()
         for profile, seed in itertools.product(("sensor", "realistic"), range(options.seeds)):
             states = window(Go2Device(draw_truth(profile, seed), **settings), 500)  # type: ignore[arg-type]
-            answer = read_support(states).support.value
+            answer = read_support(states, SUPPORT).support.value
             answers.add(answer)
             position = np.median([state.position for state in states], axis=0)
             effort = np.median([state.effort for state in states], axis=0)
-            reach = -foot_positions(position)[:, 2]
+            reach = -GEOMETRY.foot_positions(position)[:, 2]
             speed = np.abs(np.median([state.velocity for state in states], axis=0)).max()
             feet = np.median([state.foot_force for state in states], axis=0)
             rows.append(
-                (reach.mean(), np.sort(reach)[1], foot_loads(position, effort)[:, 2].sum(), feet.max(), speed)
+                (
+                    reach.mean(),
+                    np.sort(reach)[1],
+                    GEOMETRY.foot_loads(position, effort)[:, 2].sum(),
+                    feet.max(),
+                    speed,
+                )
             )
             values = dict(zip(COLUMNS, map(float, rows[-1]), strict=True))
             found.add({"situation": name, "profile": profile, "seed": seed, "answer": answer, **values}, "")

@@ -9,12 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.descriptions.leg_geometry import (
-    WEIGHT_N,
-    foot_jacobians,
-    foot_loads,
-    foot_positions,
-)
+from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY
 from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.rotations import heading, rotated
 from deal_hw.sim.legged.velocity_filter import filtered_velocity, standing_feet
@@ -38,10 +33,13 @@ def walked(trajectory: Trajectory) -> Track | None:
     time_s, orientation = trajectory.device_s[sound], body.orientation[sound]
     position, effort = trajectory.position[sound], trajectory.effort[sound]
     answers = _answers(orientation, body.angular_velocity[sound], position, trajectory.velocity[sound])
-    loads = foot_loads(position, effort)
+    loads = GEOMETRY.foot_loads(position, effort)
     load = np.stack([rotated(orientation, loads[:, leg])[:, 2] for leg in range(4)], axis=1)
     velocity = filtered_velocity(
-        time_s, rotated(orientation, body.acceleration[sound]), answers, standing_feet(load, WEIGHT_N)
+        time_s,
+        rotated(orientation, body.acceleration[sound]),
+        answers,
+        standing_feet(load, GEOMETRY.weight_n),
     )
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time_s)[:, None]
     place = np.concatenate((np.zeros((1, 2)), np.cumsum(steps[:, :2], axis=0)))
@@ -54,8 +52,8 @@ def _answers(
     """Return the velocity of the base in the world by each foot, as if that foot stood, (T, 4, 3) [m/s]."""
     T = len(position)
     joints, hip = velocity.reshape(T, 4, 3), position.reshape(T, 4, 3)[..., 0]
-    moved = np.einsum("tlij,tlj->tli", foot_jacobians(position), joints)
-    moved += np.cross(gyro[:, None], foot_positions(position))
+    moved = np.einsum("tlij,tlj->tli", GEOMETRY.foot_jacobians(position), joints)
+    moved += np.cross(gyro[:, None], GEOMETRY.foot_positions(position))
     # The foot turns with the calf: about x by the hip, about the turned y axis by thigh and calf.
     knee = joints[..., 1] + joints[..., 2]
     spin = gyro[:, None] + np.stack((joints[..., 0], np.cos(hip) * knee, np.sin(hip) * knee), axis=-1)

@@ -9,17 +9,18 @@ from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.leg_geometry import SUPPORT
 from deal_hw.drivers.go2.messages.body import body_state
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.state_stream import StateStream
-from deal_hw.drivers.go2.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.robot import SUBSCRIBED, UnitreeRobot
 from deal_hw.drivers.unitree.rpc import HEARD_TEXTS, STATUS_TEXTS, read_note
+from deal_hw.drivers.unitree.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import SafetyError
 from deal_hw.transport import Message, TopicTransport
@@ -53,6 +54,10 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
     Before it is released it lies down, and it must be on the floor, or on a stand, as in the description. A
     bridge between robot and network reports who controls the robot, and is listened to.
 
+    Attributes:
+        support: The limits between floor and stand.
+        other_support: The robot of deal-hw with the other support.
+
     Args:
         transport: Topics of the robot, or of a bridge to it.
         clock: The clock of the transport's stamps.
@@ -68,6 +73,8 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         "a bridge on the robot's side (deal-hw bridge), its own remote (damping) or its power switch"
     )
     wording: ClassVar[Wording] = WORDING
+    support: ClassVar[SupportConfig] = SUPPORT
+    other_support: ClassVar[str] = "go2_on_stand"
     subscribed: ClassVar[tuple[str, ...]] = (*SUBSCRIBED, topics.BRIDGE)
     info: Go2Info | None
 
@@ -85,9 +92,10 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         self._support = SupportGuard(
             self.description.name,
             Support.HELD if self.description.floating_base is None else Support.FLOOR,
+            self.other_support,
             clock,
             self._pump,
-            SupportConfig() if support_check else None,
+            self.support if support_check else None,
         )
 
     def _make_stream(self, check: StateCheck) -> StateStream:
@@ -177,3 +185,4 @@ class Go2OnStandRobot(Go2Robot):
     """A Go2 with its base on a stand."""
 
     description: ClassVar[RobotDescription] = on_stand.DESCRIPTION
+    other_support: ClassVar[str] = "go2"

@@ -169,3 +169,4 @@ class UnitreeMujocoOnStandRobot(UnitreeMujocoRobot):
     """A simulated Go2 whose base is held in the air, as by the simulator's elastic band."""
 
     description: ClassVar[RobotDescription] = without_battery(on_stand.DESCRIPTION)
+    other_support: ClassVar[str] = "go2"

@@ -16,19 +16,14 @@ from hypothesis import strategies as st
 from deal_hw.clock import VirtualClock
 from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, joint_ranges
-from deal_hw.drivers.go2.descriptions.leg_geometry import (
-    WEIGHT_N,
-    foot_jacobians,
-    foot_loads,
-    foot_positions,
-)
+from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY, SUPPORT
 from deal_hw.drivers.go2.emulator.device import LEGS_DOWN, Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
-from deal_hw.drivers.go2.support import Support, SupportConfig, read_support
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.unitree.support import Support, read_support
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray
 
@@ -52,16 +47,18 @@ def test_feet_are_where_the_model_has_them() -> None:
         data.qpos[joints] = pose
         mujoco.mj_kinematics(model, data)
         feet = np.array([data.geom(f"{leg}_foot").xpos for leg in LEGS]) - (0, 0, 1)
-        np.testing.assert_allclose(foot_positions(pose), feet, atol=2.1e-3)
+        np.testing.assert_allclose(GEOMETRY.foot_positions(pose), feet, atol=2.1e-3)
 
 
 def test_jacobians_are_the_derivatives() -> None:
     """By central differences, of all feet by all joints."""
     steps = 1e-6 * np.eye(12)
     for pose in np.random.default_rng(1).uniform(LOW, HIGH, (20, 12)):
-        moved = [(foot_positions(pose + s) - foot_positions(pose - s)) / 2e-6 for s in steps]
+        moved = [
+            (GEOMETRY.foot_positions(pose + s) - GEOMETRY.foot_positions(pose - s)) / 2e-6 for s in steps
+        ]
         expected = np.zeros((12, 4, 3))
-        for leg, jacobian in enumerate(foot_jacobians(pose)):
+        for leg, jacobian in enumerate(GEOMETRY.foot_jacobians(pose)):
             expected[3 * leg : 3 * leg + 3, leg] = jacobian.T
         np.testing.assert_allclose(moved, expected, atol=1e-8)
 
@@ -71,14 +68,14 @@ def test_jacobians_are_the_derivatives() -> None:
 def test_loads_and_efforts_are_each_others_inverse(pose: FloatArray, forces: list[float]) -> None:
     """Wherever the leg is not stretched along the line from hip to foot."""
     loads = np.array(forces).reshape(4, 3)
-    if np.abs(np.linalg.det(foot_jacobians(pose))).min() > 1e-3:
-        np.testing.assert_allclose(foot_loads(pose, efforts_under(pose, loads)), loads, atol=1e-8)
+    if np.abs(np.linalg.det(GEOMETRY.foot_jacobians(pose))).min() > 1e-3:
+        np.testing.assert_allclose(GEOMETRY.foot_loads(pose, efforts_under(pose, loads)), loads, atol=1e-8)
 
 
 def test_the_weight_is_the_models() -> None:
     """15.2 kg."""
     model = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
-    assert float(model.body_mass.sum()) * 9.81 == pytest.approx(WEIGHT_N, rel=0.005)
+    assert float(model.body_mass.sum()) * 9.81 == pytest.approx(GEOMETRY.weight_n, rel=0.005)
 
 
 # The judgement.
@@ -107,12 +104,12 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
     "lying, sport mode still stiff": (Support.FLOOR, states(RESTING, load=50.0)),
     "lying as seen on a robot": (Support.FLOOR, states(np.tile((0.0, 1.25, -2.81), 4))),
     "lying, leaning a little": (Support.FLOOR, states(RESTING, **leaning(0.3))),
-    "standing": (Support.FLOOR, states(STANDING, load=WEIGHT_N)),
+    "standing": (Support.FLOOR, states(STANDING, load=GEOMETRY.weight_n)),
     "standing, dead foot sensors": (
         Support.FLOOR,
-        states(STANDING, load=WEIGHT_N, foot_force=np.zeros(4, np.int64)),
+        states(STANDING, load=GEOMETRY.weight_n, foot_force=np.zeros(4, np.int64)),
     ),
-    "standing, efforts read a third low": (Support.FLOOR, states(STANDING, load=0.67 * WEIGHT_N)),
+    "standing, efforts read a third low": (Support.FLOOR, states(STANDING, load=0.67 * GEOMETRY.weight_n)),
     "hanging": (Support.HELD, states(LEGS_DOWN)),
     "hanging, held in the standing pose": (Support.HELD, states(STANDING, load=-12.0)),
     "hanging, feet sensors with offsets": (
@@ -123,14 +120,14 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
     "hanging, one leg left folded": (Support.HELD, states(ONE_FOLDED)),
     "hanging, leaning a little": (Support.HELD, states(LEGS_DOWN, **leaning(0.3, axis=1))),
     "hanging, legs left half folded": (Support.UNDECIDED, states(HALF_FOLDED)),
-    "feet on the floor, half in a sling": (Support.UNDECIDED, states(STANDING, load=0.4 * WEIGHT_N)),
-    "legs pulled down": (Support.UNDECIDED, states(STANDING, load=-0.4 * WEIGHT_N)),
+    "feet on the floor, half in a sling": (Support.UNDECIDED, states(STANDING, load=0.4 * GEOMETRY.weight_n)),
+    "legs pulled down": (Support.UNDECIDED, states(STANDING, load=-0.4 * GEOMETRY.weight_n)),
     "limp legs on the floor": (Support.UNDECIDED, states(STANDING, foot_force=np.array((90, 80, 20, 20)))),
     "on its side": (Support.UNDECIDED, states(STANDING, **leaning(1.5))),
     "the reported case": (Support.UNDECIDED, states(RESTING, **leaning(0.85))),
     "on its back": (Support.UNDECIDED, states(STANDING, **leaning(3.1))),
     "swinging": (Support.UNDECIDED, states(LEGS_DOWN, angular_velocity=np.array((0.0, 0.6, 0.0)))),
-    "walking": (Support.UNDECIDED, states(STANDING, load=WEIGHT_N, velocity=np.full(12, 2.0))),
+    "walking": (Support.UNDECIDED, states(STANDING, load=GEOMETRY.weight_n, velocity=np.full(12, 2.0))),
     "falling": (Support.UNDECIDED, states(STANDING, specific_force=np.array((0.0, 0.0, 1.0)))),
     "orientation upside down": (
         Support.UNDECIDED,
@@ -151,7 +148,7 @@ CASES: dict[str, tuple[Support, list[LowState]]] = {
 def test_truth_table(name: str) -> None:
     """Each situation has its answer, and what does not tell comes with what to do."""
     expected, given_states = CASES[name]
-    found = read_support(given_states)
+    found = read_support(given_states, SUPPORT)
     assert found.support is expected, found
     assert bool(found.remedy) == (expected is Support.UNDECIDED)
 
@@ -160,7 +157,7 @@ def test_truth_table(name: str) -> None:
 @given(st.floats(-0.5, 1.5), st.sampled_from((LEGS_DOWN, STANDING)))
 def test_the_load_decides_where_the_legs_are_down(share: float, pose: FloatArray) -> None:
     """Below a quarter of the weight nothing is carried, above half it stands, between nobody knows."""
-    found = read_support(states(pose, load=share * WEIGHT_N)).support
+    found = read_support(states(pose, load=share * GEOMETRY.weight_n), SUPPORT).support
     if min(abs(abs(share) - 0.25), abs(share - 0.5)) < 1e-6:
         return
     expected = Support.FLOOR if share > 0.5 else Support.HELD if abs(share) < 0.25 else Support.UNDECIDED
@@ -171,16 +168,16 @@ def test_the_load_decides_where_the_legs_are_down(share: float, pose: FloatArray
 @pytest.mark.parametrize(("angle", "support"), [(0.34, Support.HELD), (0.36, Support.UNDECIDED)])
 def test_a_stand_is_level(axis: int, angle: float, support: Support) -> None:
     """To 0.35 rad, in any direction, as in the run that follows."""
-    assert read_support(states(LEGS_DOWN, **leaning(angle, axis))).support is support
+    assert read_support(states(LEGS_DOWN, **leaning(angle, axis)), SUPPORT).support is support
 
 
 @pytest.mark.parametrize(
     "changes", [{"force_m_s2": 0.0}, {"loaded": 0.2}, {"held_reach_m": 0.1}, {"level_rad": math.nan}]
 )
-def test_settings_that_mean_nothing_are_refused(changes: dict[str, float]) -> None:
+def test_settings_that_mean_nothing_are_refused(changes: dict[str, Any]) -> None:
     """Neither negative, nor in the wrong order."""
     with pytest.raises(ConfigurationError):
-        SupportConfig(**changes)
+        dataclasses.replace(SUPPORT, **changes)
 
 
 @pytest.mark.parametrize("profile", ["sensor", "realistic"])
@@ -193,7 +190,8 @@ def test_an_emulated_robot_is_told_with_a_margin(
     device = Go2Device(draw_truth(profile, 3), on_stand=on_stand, start=start, sport=sport)
     sent = device.advance_to(800_000_000)
     frames = [decode_low_state(payload) for topic, payload in sent if topic == topics.LOW_STATE][-150:]
-    tight = SupportConfig(
+    tight = dataclasses.replace(
+        SUPPORT,
         held_reach_m=0.25,
         lying_reach_m=0.08,
         unloaded=0.12,

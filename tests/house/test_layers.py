@@ -88,7 +88,7 @@ ROOMS = {
     "drivers.go2": (
         {"descriptions", "wording"},
         {"messages"},
-        {"emulator", "motions", "odometry", "state_stream", "support"},
+        {"emulator", "motions", "odometry", "state_stream"},
         {"bridge", "doctor"},
         {"robot"},
         {"unitree_mujoco"},
@@ -309,7 +309,7 @@ def test_seeded_violation_is_caught(path: str, source: str, reason: str) -> None
         ("drivers/x.py", "import serial\nfrom deal_hw.sim.model import build\nfrom deal_hw.drivers import y"),
         (
             "drivers/go2/robot.py",
-            "from deal_hw.drivers.go2 import support\nfrom deal_hw.drivers.go2.messages import body",
+            "from deal_hw.drivers.go2 import state_stream\nfrom deal_hw.drivers.go2.messages import body",
         ),
         (
             "deal_hw/bench/x.py",

@@ -15,7 +15,7 @@ import numpy as np
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_jacobians
+from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
 from deal_hw.drivers.go2.robot import Go2Robot
@@ -34,12 +34,12 @@ def efforts_under(position: FloatArray, loads: FloatArray) -> FloatArray:
         position: Joint positions, (12,) [rad].
         loads: Force of the floor on each foot, (4, 3) [N].
     """
-    return np.asarray(-np.einsum("lij,li->lj", foot_jacobians(position), loads).reshape(12))
+    return np.asarray(-np.einsum("lij,li->lj", GEOMETRY.foot_jacobians(position), loads).reshape(12))
 
 
 RESTING: Final = np.array(DRIVER.rest_position)
 STANDING: Final = np.array(DRIVER.default_position)
-STANDING_EFFORT: Final = efforts_under(STANDING, np.array([[0.0, 0.0, WEIGHT_N / 4]] * 4))
+STANDING_EFFORT: Final = efforts_under(STANDING, np.array([[0.0, 0.0, GEOMETRY.weight_n / 4]] * 4))
 """Motor efforts of a standing robot [N·m]."""
 ANSWER_NS: Final = 3_000_000
 STIFF: Final = LowCommandEncoder().encode(

@@ -1,8 +1,8 @@
-"""Decides what supports a Go2: the floor, or a stand that holds its body in the air.
+"""Decides what supports a quadruped: the floor, or a stand that holds its body in the air.
 
-deal-hw has a robot for each (``go2``, ``go2_on_stand``), and commands for one are dangerous to the other. No
-sensor measures the support. Two quantities decide: the distance of the feet below the base, along gravity,
-and the force that the legs carry, from the motors' estimated efforts.
+deal-hw has a robot for each, such as ``go2`` and ``go2_on_stand``, and commands for one are dangerous to the
+other. No sensor measures the support. Two quantities decide: the distance of the feet below the base, along
+gravity, and the force that the legs carry, from the motors' estimated efforts.
 
 - Legs that carry half of the weight stand on the floor.
 - A robot with folded legs lies. Legs that were folded when the robot was lifted look the same.
@@ -18,21 +18,58 @@ import contextlib
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.control.safety.leg_checks import UNIT_TOLERANCE, tilt
-from deal_hw.drivers.go2.descriptions.driver import HELD_TILT_RAD
-from deal_hw.drivers.go2.descriptions.leg_geometry import WEIGHT_N, foot_loads, foot_positions
-from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame
+from deal_hw.drivers.unitree.leg_geometry import LegGeometry
 from deal_hw.errors import ConfigurationError, SafetyError, TransportTimeoutError
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
 
 GRAVITY_M_S2: Final = 9.81
 PATIENCE_S: Final = 3.0
 """Longest wait until the robot is still [s]."""
+
+
+class SupportState(Protocol):
+    """What is read in a state; arrays in model order (legs FL, FR, RL, RR)."""
+
+    @property
+    def position(self) -> FloatArray:
+        """Positions, (12,) [rad]."""
+        ...
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Speeds, (12,) [rad/s]."""
+        ...
+
+    @property
+    def effort(self) -> FloatArray:
+        """The motors' estimated efforts, (12,) [N·m]."""
+        ...
+
+    @property
+    def orientation(self) -> FloatArray:
+        """Quaternion wxyz, base in the world, (4,)."""
+        ...
+
+    @property
+    def angular_velocity(self) -> FloatArray:
+        """Base's frame, (3,) [rad/s]."""
+        ...
+
+    @property
+    def specific_force(self) -> FloatArray:
+        """Base's frame, (3,) [m/s²]."""
+        ...
+
+    @property
+    def foot_force(self) -> IntArray:
+        """Sensor units, (4,)."""
+        ...
 
 
 class Support(enum.Enum):
@@ -56,7 +93,10 @@ LEAST_STATES: Final = 50
 class SupportConfig:
     """Limits between floor and stand. They come from the emulator; no real robot was measured."""
 
-    level_rad: float = HELD_TILT_RAD
+    legs: LegGeometry
+    """Lengths of the legs, and the robot's weight."""
+
+    level_rad: float
     """Largest tilt of a body that lies level or hangs level [rad]."""
 
     joint_rad_s: float = 0.5
@@ -71,12 +111,11 @@ class SupportConfig:
     sensors_rad: float = 0.2
     """Largest angle between the directions of gravity by orientation and by specific force [rad]."""
 
-    held_reach_m: float = 0.16
-    """Three feet of a hanging robot reach further below the base than this. At 0.35 rad of tilt the trunk's
-    lowest point is 0.12 m below it [m]."""
+    held_reach_m: float
+    """Three feet of a hanging robot reach further below the base than this [m]."""
 
-    lying_reach_m: float = 0.125
-    """The feet of a lying robot reach no further on average; 0.10 m in the vendor's rest pose [m]."""
+    lying_reach_m: float
+    """The feet of a lying robot reach no further on average [m]."""
 
     unloaded: float = 0.25
     """Legs that carry less than this share of the weight count as unloaded; 1 N·m of friction in each knee
@@ -89,9 +128,9 @@ class SupportConfig:
     """A foot sensor above this is pressed, whatever its offset: free ones may show 30 [sensor units]."""
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            if not getattr(self, entry.name) > 0:
-                raise ConfigurationError(f"{entry.name} must be positive, got {getattr(self, entry.name)}")
+        for name in (entry.name for entry in fields(self) if entry.name != "legs"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)}")
         if not (self.unloaded < self.loaded and self.lying_reach_m < self.held_reach_m):
             raise ConfigurationError("unloaded is less than loaded, and lying_reach_m than held_reach_m")
 
@@ -111,16 +150,13 @@ class SupportReading:
     remedy: str = ""
 
 
-def read_support(
-    states: Sequence[LowState | LowStateFrame], config: SupportConfig | None = None
-) -> SupportReading:
+def read_support(states: Sequence[SupportState], config: SupportConfig) -> SupportReading:
     """Return what supports the robot, by the states of a short time.
 
     Args:
         states: In order of time.
         config: The limits between floor and stand.
     """
-    config = config or SupportConfig()
     if len(states) < LEAST_STATES:
         return _undecided(f"only {len(states)} states came within {WINDOW_S:g} s", "check the cable")
     position = np.median([state.position for state in states], axis=0)
@@ -136,8 +172,8 @@ def read_support(
     if doubt is not None:
         return doubt
     up = _up(orientation)
-    reach = -foot_positions(position) @ up
-    load = float((foot_loads(position, effort) @ up).sum())
+    reach = -config.legs.foot_positions(position) @ up
+    load = float((config.legs.foot_loads(position, effort) @ up).sum())
     feet = np.median([state.foot_force for state in states], axis=0)
     return _judge(reach, load, feet, config)
 
@@ -145,16 +181,16 @@ def read_support(
 def _judge(reach: FloatArray, load: float, feet: FloatArray, config: SupportConfig) -> SupportReading:
     """Decide by the feet's distances below the base (4,) [m], a load [N] and foot sensors (4,)."""
     # The second smallest, not the smallest: one leg may be folded.
-    third, mean = float(np.sort(reach)[1]), float(reach.mean())
-    carried = f"its legs carry {load:.0f} N of its {WEIGHT_N:.0f} N"
-    if load > config.loaded * WEIGHT_N:
+    third, mean, weight_n = float(np.sort(reach)[1]), float(reach.mean()), config.legs.weight_n
+    carried = f"its legs carry {load:.0f} N of its {weight_n:.0f} N"
+    if load > config.loaded * weight_n:
         return SupportReading(Support.FLOOR, carried)
     if mean < config.lying_reach_m:
         return SupportReading(
             Support.FLOOR, f"its legs are folded: its feet reach {mean:.2f} m below its body"
         )
     seen = f"its feet reach {mean:.2f} m below its body, and {carried}"
-    if abs(load) > config.unloaded * WEIGHT_N:
+    if abs(load) > config.unloaded * weight_n:
         return _undecided(
             seen, "raise the stand until the feet are free, or lower the robot until it lies on the floor"
         )
@@ -214,6 +250,7 @@ class SupportGuard:
     Args:
         name: The robot's name in deal-hw.
         expected: FLOOR or HELD.
+        other: Name of the robot with the other support.
         clock: For waiting.
         pump: Receives one message, waiting at most this long [s]; TransportTimeoutError if none arrives.
         config: The limits between floor and stand; None: nothing is checked.
@@ -223,15 +260,17 @@ class SupportGuard:
         self,
         name: str,
         expected: Support,
+        other: str,
         clock: Clock,
         pump: Callable[[float], None],
         config: SupportConfig | None,
     ) -> None:
-        self._name, self._expected, self._clock, self._pump = name, expected, clock, pump
+        self._name, self._expected, self._other = name, expected, other
+        self._clock, self._pump = clock, pump
         self._config = config
-        self._states: list[LowStateFrame] | None = None
+        self._states: list[SupportState] | None = None
 
-    def take(self, state: LowStateFrame) -> None:
+    def take(self, state: SupportState) -> None:
         """Take a new state; it is used only during a check."""
         if self._states is not None:
             self._states.append(state)
@@ -265,7 +304,7 @@ class SupportGuard:
 
     def _read(self, config: SupportConfig) -> SupportReading:
         """Receive new states for the window's length, and decide."""
-        states: list[LowStateFrame] = []
+        states: list[SupportState] = []
         until_ns = self._clock.now_ns() + round(WINDOW_S * 1e9)
         self._states = states
         try:
@@ -289,10 +328,10 @@ class SupportGuard:
             return (
                 f"{self._name}: something holds the robot in the air: {found.seen}. `{self._name}` is the "
                 "robot on the floor: it would stand up and walk in the air. Lay it on the floor, or take the "
-                f"robot `go2_on_stand`. {skip}"
+                f"robot `{self._other}`. {skip}"
             )
         return (
             f"{self._name}: the robot is on the floor: {found.seen}. `{self._name}` makes a standing robot "
             "limp and moves its legs as in free air: it would fall. Hang it up with its feet free (if it "
-            f"hangs already, pull its legs down by hand), or take the robot `go2`. {skip}"
+            f"hangs already, pull its legs down by hand), or take the robot `{self._other}`. {skip}"
         )
