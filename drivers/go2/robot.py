@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
+import numpy as np
+
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand
@@ -17,6 +19,7 @@ from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.motor_command import MODE_SERVO
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.robot import SUBSCRIBED, UnitreeRobot
 from deal_hw.drivers.unitree.rpc import HEARD_TEXTS, STATUS_TEXTS, read_note
@@ -55,6 +58,7 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
     bridge between robot and network reports who controls the robot, and is listened to.
 
     Attributes:
+        servo_mode: Mode of a motor that follows commands.
         support: The limits between floor and stand.
         other_support: The robot of deal-hw with the other support.
 
@@ -73,6 +77,7 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         "a bridge on the robot's side (deal-hw bridge), its own remote (damping) or its power switch"
     )
     wording: ClassVar[Wording] = WORDING
+    servo_mode: ClassVar[int] = MODE_SERVO
     support: ClassVar[SupportConfig] = SUPPORT
     other_support: ClassVar[str] = "go2_on_stand"
     subscribed: ClassVar[tuple[str, ...]] = (*SUBSCRIBED, topics.BRIDGE)
@@ -87,7 +92,8 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         state_check: StateCheck = "strict",
         support_check: bool = True,
     ) -> None:
-        self._encoder = LowCommandEncoder()
+        self._encoder = LowCommandEncoder(self.servo_mode)
+        self._modes = np.full(len(self.description.actuated), self.servo_mode)
         super().__init__(transport, clock, stop_buttons, self._make_stream(state_check))
         self._support = SupportGuard(
             self.description.name,
@@ -115,7 +121,7 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         damping: FloatArray,
         effort: FloatArray,
     ) -> bytes:
-        return self._encoder.encode(LowCommand(position, velocity, stiffness, damping, effort))
+        return self._encoder.encode(LowCommand(position, velocity, stiffness, damping, effort, self._modes))
 
     def _read_info(self) -> Go2Info | None:
         if self._frame is None:

@@ -11,8 +11,7 @@ from deal_hw.drivers.unitree.motor_command import MODE_SERVO, POSITION_STOP, VEL
 from deal_hw.types import FloatArray, IntArray
 
 AMBIENT_C: Final = 28.0
-_HEAT_K_PER_NM2: Final = 0.25
-"""Final warming for the square of the torque."""
+_HEAT_K_NM2: Final = 0.25
 _WARMING_S: Final = 150.0
 
 
@@ -37,6 +36,8 @@ class PdMotors:
         no_load: Speed without load, (J,) [rad/s].
         knee: Share of that speed up to which a motor gives full torque; from there it falls linearly. 1: full
             torque at any speed.
+        servo_modes: Modes in which a motor follows commands; in any other it is off.
+        heat_k_nm2: Final warming for the square of the torque [K/(N·m)²].
     """
 
     def __init__(
@@ -47,11 +48,13 @@ class PdMotors:
         limit: Sequence[float],
         no_load: Sequence[float],
         knee: float,
+        servo_modes: Sequence[int] = (MODE_SERVO,),
+        heat_k_nm2: float = _HEAT_K_NM2,
     ) -> None:
         count = len(stiffness)
         self._stiffness_factor, self._damping_factor = np.array(stiffness), np.array(damping)
         self._bias, self._limit, self._no_load = np.array(bias), np.array(limit), np.array(no_load)
-        self._knee = knee
+        self._knee, self._servo_modes, self._heat_k_nm2 = knee, tuple(servo_modes), heat_k_nm2
         self._q, self._dq, self._kp, self._kd, self._tau = np.zeros((5, count))
         self._alive, self._any_dead = np.ones(count), False
         self.mode: IntArray = np.zeros(count, np.int64)
@@ -61,7 +64,7 @@ class PdMotors:
 
     def accept(self, command: MotorCommand) -> None:
         """Hold this command from now on."""
-        on = command.mode == MODE_SERVO
+        on = np.isin(command.mode, self._servo_modes)
         # The vendor's stop values switch a loop off at any gain.
         position_on = on & (np.abs(command.position) < POSITION_STOP / 2)
         velocity_on = on & (np.abs(command.velocity) < VELOCITY_STOP)
@@ -102,7 +105,7 @@ class PdMotors:
 
     def warm(self, seconds: float) -> None:
         """Warm the motors by their efforts, and count the commands that dead ones miss."""
-        steady = AMBIENT_C + _HEAT_K_PER_NM2 * self.effort * self.effort
+        steady = AMBIENT_C + self._heat_k_nm2 * self.effort * self.effort
         self.temperature += (seconds / _WARMING_S) * (steady - self.temperature)
         if self._any_dead:
             # A new array, because earlier states keep the old one.

@@ -43,5 +43,5 @@ class MotorCommand(Protocol):
 
     @property
     def mode(self) -> IntArray:
-        """1 servo, 0 off."""
+        """The servo's number (1 on most robots), 0 off."""
         ...

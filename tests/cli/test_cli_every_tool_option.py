@@ -345,15 +345,16 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         monkeypatch.setattr(str(wire.emulator).replace(":", "."), note("emulator", emulator))
     from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.g1.emulator.truth import nominal_truth as nominal_g1
-    from deal_hw.drivers.go2.emulator.truth import nominal_truth as nominal_go2
+    from deal_hw.drivers.go2.emulator.truth import Go2Truth
 
     for target, truth in (
         ("cartpole.emulator.oracle", nominal_cartpole),
-        ("go2.emulator.truth", nominal_go2),
         ("g1.emulator.truth", nominal_g1),
     ):
         drawn = note("drawn", truth("sensor", 0))
         monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
+    for quadruped in (Go2Truth,):
+        monkeypatch.setattr(quadruped, "draw", note("drawn", quadruped.nominal("sensor", 0)))
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
     monkeypatch.setattr("deal_hw.drivers.go2.emulator.device.Go2Device", note("device", device))
     monkeypatch.setattr("deal_hw.drivers.g1.emulator.device.G1Device", note("device", device))

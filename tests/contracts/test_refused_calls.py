@@ -29,6 +29,7 @@ from deal_hw.data.table import Table
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.go2.emulator.sport_service import SportMode
+from deal_hw.drivers.go2.emulator.truth import GO2
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -119,7 +120,7 @@ SETTINGS: list[tuple[Callable[[], object], type[Exception], str]] = [
         ConfigurationError,
         "--domain, --mode would have no effect: transport 'serial' is no network",
     ),
-    (lambda: SportMode("moonwalk"), UnknownNameError, "unknown sport mode 'moonwalk'"),
+    (lambda: SportMode(GO2, "moonwalk"), UnknownNameError, "unknown sport mode 'moonwalk'"),
     (lambda: draw_truth("nosuch", 0), UnknownNameError, "unknown profile 'nosuch'"),
     (
         lambda: supervised.run_episodes(PLAN, port="p", dataset=None, episodes=0, purpose="x"),

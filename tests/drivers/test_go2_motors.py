@@ -14,7 +14,7 @@ from deal_hw.drivers.go2.descriptions.floor import JOINTS
 from deal_hw.drivers.go2.descriptions.on_stand_recording import biased_space
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.motors import Motors
-from deal_hw.drivers.go2.emulator.profiles import profile
+from deal_hw.drivers.go2.emulator.profiles import PROFILES
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment, read_remote_script
 from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand
@@ -38,7 +38,7 @@ def command(
 
 def test_effort_is_p_d_with_feed_forward() -> None:
     """40 * (0.3 - 0.1) - 2 * 1.5 + 0.5 = 5.5 N·m."""
-    motors = Motors(nominal_truth(), profile("ideal"))
+    motors = Motors(nominal_truth(), PROFILES["ideal"])
     motors.accept(command(40.0, 2.0, 0.5, 0.3))
     motors.update(np.full(12, 0.1), np.full(12, 1.5))
     assert np.allclose(motors.effort, 5.5)
@@ -48,7 +48,7 @@ def test_effort_is_p_d_with_feed_forward() -> None:
 
 def test_effort_is_limited_by_part() -> None:
     """Hips and thighs stop at 23.7 N·m, calves at 45.43, either way."""
-    motors = Motors(nominal_truth(), profile("ideal"))
+    motors = Motors(nominal_truth(), PROFILES["ideal"])
     motors.accept(command(effort=100.0))
     motors.update(ZERO, ZERO)
     assert motors.effort.reshape(4, 3).tolist() == [[23.7, 23.7, 45.43]] * 4
@@ -65,7 +65,7 @@ def test_effort_is_limited_by_part() -> None:
 )
 def test_the_torque_speed_limit_spares_braking(share: float, effort: float) -> None:
     """A realistic motor weakens towards its no-load speed, and brakes with all it has."""
-    motors = Motors(nominal_truth(), profile("realistic"))
+    motors = Motors(nominal_truth(), PROFILES["realistic"])
     motors.accept(command(effort=100.0))
     motors.update(ZERO, np.full(12, share * 30.1))
     assert motors.effort[0] == pytest.approx(effort)
@@ -73,7 +73,7 @@ def test_the_torque_speed_limit_spares_braking(share: float, effort: float) -> N
 
 def test_motors_warm_up_towards_the_square_of_the_torque() -> None:
     """10 N·m end at 28 + 0.25 * 100 = 53 °C; after one time constant of 150 s, 63 % of the way."""
-    motors = Motors(nominal_truth(), profile("ideal"))
+    motors = Motors(nominal_truth(), PROFILES["ideal"])
     motors.accept(command(effort=10.0))
     motors.update(ZERO, ZERO)
     for _ in range(1500):

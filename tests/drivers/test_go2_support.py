@@ -17,8 +17,8 @@ from deal_hw.clock import VirtualClock
 from deal_hw.control.safety.passive import make_passive
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, joint_ranges
 from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY, SUPPORT
-from deal_hw.drivers.go2.emulator.device import LEGS_DOWN, Go2Device
-from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import HANGING, draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports import topics
@@ -96,6 +96,7 @@ def leaning(angle: float, axis: int = 0) -> dict[str, Any]:
     return {"orientation": orientation, "specific_force": force}
 
 
+LEGS_DOWN = np.array(HANGING)
 ONE_FOLDED = np.concatenate((LEGS_DOWN[:9], RESTING[9:]))
 HALF_FOLDED = np.tile((-0.82, 0.83, -2.59, 0.82, 0.83, -2.59), 2)
 """Where friction leaves the legs of an emulated robot that is lifted while it lies."""

@@ -17,6 +17,7 @@ from deal_hw.data.recording.record import encode as encode_record
 from deal_hw.data.recording.schemas import BODY, COMMAND, CYCLE, EVENT, ROBOT, STATE, WIRE
 from deal_hw.drivers.cartpole.wire import protocol as serial
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
+from deal_hw.drivers.go2.emulator.truth import GO2
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.sport_state import LONG_BYTES, SHORT_BYTES, decode_sport_state
@@ -129,7 +130,7 @@ def _requests() -> list[bytes]:
 
 def _serve(data: bytes) -> None:
     """Act on a request as the emulator's services do."""
-    ServiceServer(SportMode()).answer("motion_switcher", data, np.zeros(12), 1000)
+    ServiceServer(SportMode(GO2)).answer("motion_switcher", data, np.zeros(12), 1000)
 
 
 def _odd_request(rng: random.Random, data: bytes, others: Sequence[bytes]) -> bytes:

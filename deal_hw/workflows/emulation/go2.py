@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
+from deal_hw.robots.entry import load
 from deal_hw.workflows.emulation.common import choose_truth
 from deal_hw.workflows.emulation.settings import EmulateGo2Settings
 from deal_hw.workflows.emulation.topics import emulate_on_topics, of_every_robot
@@ -23,8 +24,10 @@ from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
-    from deal_hw.drivers.go2.emulator.truth import Go2Truth
+    from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
 
+TRUTHS: Final[Mapping[str, str]] = {"go2": "deal_hw.drivers.go2.emulator.truth:Go2Truth"}
+"""Hidden parameters of each quadruped: the class, as a reference."""
 TRACK_COLUMNS = ("time_s", "x", "y", "heading")
 TRACK_NS = 10_000_000
 
@@ -94,13 +97,14 @@ def read_track(path: Path) -> Track:
         return Track(rows[:, 0], rows[:, 1:3], rows[:, 3])
 
 
-def _truth(config: EmulateGo2Settings) -> Go2Truth:
-    from deal_hw.drivers.go2.emulator.truth import DEFAULT_RANGE_RATIO, Go2Truth, draw_truth, nominal_truth
+def _truth(config: EmulateGo2Settings) -> QuadrupedTruth:
+    from deal_hw.drivers.unitree.emulated_quadruped import DEFAULT_RANGE_RATIO
 
-    return choose_truth(config, nominal_truth, draw_truth, Go2Truth.from_json, DEFAULT_RANGE_RATIO)
+    kind: type[QuadrupedTruth] = load(TRUTHS[config.robot], f"robot {config.robot!r}")
+    return choose_truth(config, kind.nominal, kind.draw, kind.from_json, DEFAULT_RANGE_RATIO)
 
 
-def _device(config: EmulateGo2Settings, truth: Go2Truth) -> Go2Device:
+def _device(config: EmulateGo2Settings, truth: QuadrupedTruth) -> Go2Device:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.go2.emulator.remote_script import read_remote_script
     from deal_hw.sim.legged.terrain import Terrain

@@ -9,16 +9,13 @@ from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
-from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS
-from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as RECORDED
+from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.motors import Motors
-from deal_hw.drivers.go2.emulator.profiles import profile as find_profile
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment
 from deal_hw.drivers.go2.emulator.sensing import Sensing
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, PERIOD_MS, STANDING, Posture
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
-from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
 from deal_hw.drivers.go2.messages.sport_state import POINTS, SportState, encode_sport_state
@@ -31,6 +28,7 @@ from deal_hw.drivers.unitree.emulated_device import (
     UnitreeDevice,
     require_finite,
 )
+from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
 from deal_hw.drivers.unitree.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.rotations import heading
 from deal_hw.sim.legged.simulation import LeggedSimulation
@@ -43,18 +41,16 @@ SPORT_STATE_PHASES: Final = (0, 3, 6)
 WIRELESS_MS: Final = 10
 PUSH_MS: Final = 100
 SETTLE_TICKS: Final = 1500
-LEGS_DOWN: Final = np.tile((0.0, 0.34, -0.85), 4)
-"""Pose of limp legs in the air, without the hips: the calf's weight opens the knee to its stop."""
 
 
 class Go2Device(UnitreeDevice[LowCommand]):
-    """An emulated Go2 without real time and wire.
+    """An emulated Go2, or another quadruped of its kind, without real time and wire.
 
     Attributes:
         sport_on_wire: Whether sport mode's own commands are published.
 
     Args:
-        truth: Hidden parameters, profile, seed.
+        truth: Hidden parameters, profile, seed; of the robot that is emulated.
         on_stand: Whether the base is on a stand.
         start: Limp, lying or with its legs hanging down, or standing with sport mode in control.
         sport: Name of the sport mode that is active at power-up; "" for none.
@@ -69,7 +65,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
 
     def __init__(
         self,
-        truth: Go2Truth,
+        truth: QuadrupedTruth,
         *,
         on_stand: bool = False,
         start: Literal["lying", "standing"] = "lying",
@@ -81,10 +77,11 @@ class Go2Device(UnitreeDevice[LowCommand]):
         terrain: Terrain | None = None,
     ) -> None:
         self._truth, self._plan = truth, plan or FaultPlan()
-        profile = find_profile(truth.profile)
-        streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0x602]).spawn(4)]
-        sensor_rng, jitter_rng, self._drop_rng, fault_rng = streams
-        mjcf = (RECORDED if on_stand else DESCRIPTION).mjcf
+        machine = self._machine = truth.machine
+        profile = machine.profile(truth.profile)
+        seeds = np.random.SeedSequence([truth.seed, machine.stream]).spawn(4)
+        sensor_rng, jitter_rng, self._drop_rng, fault_rng = map(np.random.default_rng, seeds)
+        mjcf = machine.stand_mjcf if on_stand else machine.floor_mjcf
         super().__init__(
             LeggedSimulation(mjcf, JOINTS, [f"{leg}_foot" for leg in LEGS], TICK_NS * 1e-9, terrain=terrain),
             truth,
@@ -99,10 +96,10 @@ class Go2Device(UnitreeDevice[LowCommand]):
         self._sim.set_floor_friction(truth.floor_friction)
         self._motors = Motors(truth, profile)
         self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng)
-        self._sport = SportMode(sport)
+        self._sport = SportMode(machine, sport)
         self._services = ServiceServer(self._sport)
         self.sport_on_wire = sport_on_wire
-        self._encoder = LowCommandEncoder()
+        self._encoder = LowCommandEncoder(machine.servo_modes[0])
         self._wire_faulty = self._state_faults.any and self._plan.wire_after_s is None
         self._hold(None if remote is None else Remote())
         self._remote_script = deque(remote or ())
@@ -111,7 +108,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
         self._last: LowState | None = None
         self._feet_before = np.zeros((4, 3)), 0
         self._largest_tilt = 0.0
-        self._begin(start, LEGS_DOWN if on_stand else LYING)
+        self._begin(start, np.array(machine.hanging) if on_stand else LYING)
 
     @property
     def published(self) -> tuple[str, ...]:
@@ -151,9 +148,11 @@ class Go2Device(UnitreeDevice[LowCommand]):
 
     def report(self) -> dict[str, Any]:
         """Return a report as plain JSON values: truth, messages, commands, faults, final state."""
+        stiffness, damping = self._machine.stand_gains
+        at_gains = f"parameters_at_kp{stiffness:g}_kd{damping:g}"
         return {
             **self._truth.to_json(),
-            "parameters_at_kp20_kd1.5": self._truth.parameters(20.0, 1.5),
+            at_gains: self._truth.parameters(stiffness, damping),
             "walk_parameters": self._truth.walk_parameters(),
             **self._happened(),
             "base_height_m": self.base_height,
@@ -191,12 +190,14 @@ class Go2Device(UnitreeDevice[LowCommand]):
     def _begin(self, start: str, limp: FloatArray) -> None:
         """Settle in the start posture; device time does not advance."""
         sim, motors, controller = self._sim, self._motors, self._sport.controller
-        sim.set_pose(STANDING if start == "standing" else limp, 0.34 if start == "standing" else 0.13)
-        if start == "standing":
+        machine = self._machine
+        stands = start == "standing"
+        sim.set_pose(STANDING if stands else limp, machine.standing_m if stands else machine.lying_m)
+        if stands:
             controller.take(Posture.STANDING, STANDING, -10_000)
         motors.accept(controller.command(0))
         self._settle(SETTLE_TICKS)
-        if not self._sport.name and start == "lying":
+        if not self._sport.name and not stands:
             self._motors = self._sensing.motors = Motors(self._truth, self._profile)
 
     @property

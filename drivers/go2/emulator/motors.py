@@ -1,27 +1,29 @@
-"""The emulated Go2's twelve motors."""
+"""The twelve motors of an emulated quadruped."""
 
 from __future__ import annotations
 
-from deal_hw.drivers.go2.descriptions.floor import EFFORT_LIMIT_NM, VELOCITY_LIMIT_RAD_S, per_joint
-from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.unitree.emulated_motors import PdMotors
 from deal_hw.drivers.unitree.emulated_profile import SensorProfile
+from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
 
 
 class Motors(PdMotors):
     """Twelve motors in model order.
 
     Args:
-        truth: True gains over commanded gains, encoder bias.
+        truth: True gains over commanded gains, encoder bias, and the machine's limits.
         profile: Torque-speed limit.
     """
 
-    def __init__(self, truth: Go2Truth, profile: SensorProfile) -> None:
+    def __init__(self, truth: QuadrupedTruth, profile: SensorProfile) -> None:
+        machine = truth.machine
         super().__init__(
             truth.stiffness,
             truth.damping,
             truth.encoder_bias,
-            per_joint(EFFORT_LIMIT_NM),
-            per_joint(VELOCITY_LIMIT_RAD_S),
+            machine.effort_limit,
+            machine.no_load,
             profile.knee,
+            machine.servo_modes,
+            machine.heat_k_nm2,
         )

@@ -1,4 +1,4 @@
-"""Sensors of an emulated Go2: the mechanics with noise, bias and quantisation."""
+"""Sensors of an emulated quadruped: the mechanics with noise, bias and quantisation."""
 
 from __future__ import annotations
 
@@ -8,34 +8,33 @@ from typing import Final
 import numpy as np
 
 from deal_hw.drivers.go2.emulator.motors import Motors
-from deal_hw.drivers.go2.emulator.profiles import Go2Profile
-from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.low_state import LowState
 from deal_hw.drivers.unitree.emulated_imu import roll_pitch_yaw, turned
+from deal_hw.drivers.unitree.emulated_quadruped import BatteryFacts, QuadrupedProfile, QuadrupedTruth
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 
-CELLS: Final = 8
-_CAPACITY_AS: Final = 15.0 * 3600.0
-_IDLE_A: Final = 1.2
-_LOSS_W_PER_NM2: Final = 0.3
-_RESISTANCE_OHM: Final = 0.05
+_CELL_V: Final = 3.7
 IMU_TEMPERATURE_C: Final = 58
 _HOT_C: Final = 95
 _LOW_CHARGE: Final = 0.04
 
 
 class Battery:
-    """A battery of 8 cells that the motors drain.
+    """A battery that the motors drain.
 
     Attributes:
         charge: State of charge, 0 to 1.
         current: Present current [A].
+
+    Args:
+        facts: Its cells, capacity and losses.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, facts: BatteryFacts) -> None:
+        self._facts = facts
         self.charge = 0.86
-        self.current = _IDLE_A
+        self.current = facts.idle_a
 
     @property
     def cell_mv(self) -> int:
@@ -45,13 +44,14 @@ class Battery:
     @property
     def voltage(self) -> float:
         """Voltage of the supply under load [V]."""
-        return CELLS * self.cell_mv * 1e-3 - _RESISTANCE_OHM * self.current
+        return self._facts.cells * self.cell_mv * 1e-3 - self._facts.resistance_ohm * self.current
 
     def drain(self, effort: FloatArray, velocity: FloatArray, seconds: float) -> None:
         """Deliver the motors' power for a time [s]."""
-        watts = max(0.0, float(effort @ velocity)) + _LOSS_W_PER_NM2 * float(effort @ effort)
-        self.current = _IDLE_A + watts / (CELLS * 3.7)
-        self.charge = max(0.0, self.charge - self.current * seconds / _CAPACITY_AS)
+        facts = self._facts
+        watts = max(0.0, float(effort @ velocity)) + facts.loss_w_nm2 * float(effort @ effort)
+        self.current = facts.idle_a + watts / (facts.cells * _CELL_V)
+        self.charge = max(0.0, self.charge - self.current * seconds / (3600.0 * facts.capacity_ah))
 
 
 class Sensing:
@@ -66,7 +66,7 @@ class Sensing:
     Args:
         sim: The mechanics.
         motors: The motors.
-        truth: Encoder biases.
+        truth: Encoder biases, and the battery.
         profile: Noise and resolution.
         rng: Source of the noise.
     """
@@ -75,11 +75,11 @@ class Sensing:
         self,
         sim: LeggedSimulation,
         motors: Motors,
-        truth: Go2Truth,
-        profile: Go2Profile,
+        truth: QuadrupedTruth,
+        profile: QuadrupedProfile,
         rng: np.random.Generator,
     ) -> None:
-        self.battery = Battery()
+        self.battery = Battery(truth.machine.battery)
         self.hot: int | None = None
         self.broken: int | None = None
         self._sim, self.motors, self._rng = sim, motors, rng
@@ -98,7 +98,7 @@ class Sensing:
             ),
             (12, 12, 12, 12, 3, 3, 3),
         )
-        self._cells = np.zeros(15, np.int64)
+        self._cells, self._in_series = np.zeros(15, np.int64), truth.machine.battery.cells
 
     def empty_battery(self) -> None:
         """Set the battery's charge to 4 %."""
@@ -124,7 +124,7 @@ class Sensing:
             position[self.broken] = velocity[self.broken] = math.nan
         w, x, y, z = orientation = turned(sim.orientation(), noise[48:51])
         force = np.rint(np.minimum(sim.foot_force(), 32767.0)).astype(np.int64)
-        self._cells[:CELLS] = battery.cell_mv
+        self._cells[: self._in_series] = battery.cell_mv
         return LowState(
             position=position,
             velocity=velocity,

@@ -12,18 +12,15 @@ from typing import Final
 import numpy as np
 
 from deal_hw.drivers.go2.messages.low_command import LowCommand
+from deal_hw.drivers.unitree.emulated_quadruped import SportGains
+from deal_hw.drivers.unitree.motor_command import MODE_SERVO
 from deal_hw.types import FloatArray
 
 PERIOD_MS: Final = 2
-STIFFNESS_NM_RAD: Final = 60.0
-DAMPING_NMS_RAD: Final = 5.0
-RELEASED_DAMPING_NMS_RAD: Final = 3.0
 STANDING: Final = np.tile((0.0, 0.67, -1.3), 4)
 LYING: Final = np.tile((0.0, 1.36, -2.65), 4)
-"""Poses and gains of unitree_sdk2_python's go2_stand_example."""
+"""Poses of unitree_sdk2_python's go2_stand_example; those of b2_stand_example are the same."""
 _ZEROS: Final = np.zeros(12)
-_STIFF, _DAMPED = np.full(12, STIFFNESS_NM_RAD), np.full(12, DAMPING_NMS_RAD)
-_RELEASED: Final = np.full(12, RELEASED_DAMPING_NMS_RAD)
 
 
 class Posture(enum.Enum):
@@ -53,9 +50,16 @@ class SportController:
     Attributes:
         posture: Its present posture.
         velocity: Walking speed requested last: ahead, left, turn [m/s, rad/s]; it never walks.
+
+    Args:
+        gains: Of its commands.
+        mode: Motor mode of its commands.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gains: SportGains, mode: int = MODE_SERVO) -> None:
+        self._mode = np.full(12, mode)
+        self._stiff, self._damped = np.full(12, gains.stiffness), np.full(12, gains.damping)
+        self._released = np.full(12, gains.released)
         self.posture = Posture.DAMPING
         self.velocity = (0.0, 0.0, 0.0)
         self._begin_ms = 0
@@ -82,15 +86,21 @@ class SportController:
     def command(self, now_ms: int) -> LowCommand:
         """Return the present command to the motors."""
         if self.posture is Posture.DAMPING:
-            return LowCommand(_ZEROS, _ZEROS, _ZEROS, _RELEASED, _ZEROS)
+            return self._damping()
         since_s = (now_ms - self._begin_ms) * 1e-3
         before = self._from
         for seconds, pose in _WAYS[self.posture]:
             if since_s < seconds:
                 target = before + (pose - before) * (since_s / seconds)
-                return LowCommand(target, _ZEROS, _STIFF, _DAMPED, _ZEROS)
+                return self._hold(target)
             since_s -= seconds
             before = pose
         if self.posture is Posture.DOWN:
-            return LowCommand(_ZEROS, _ZEROS, _ZEROS, _RELEASED, _ZEROS)
-        return LowCommand(before, _ZEROS, _STIFF, _DAMPED, _ZEROS)
+            return self._damping()
+        return self._hold(before)
+
+    def _hold(self, position: FloatArray) -> LowCommand:
+        return LowCommand(position, _ZEROS, self._stiff, self._damped, _ZEROS, self._mode)
+
+    def _damping(self) -> LowCommand:
+        return LowCommand(_ZEROS, _ZEROS, _ZEROS, self._released, _ZEROS, self._mode)

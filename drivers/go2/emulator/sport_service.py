@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from deal_hw.drivers.go2.emulator.sport_controller import Posture, SportController
+from deal_hw.drivers.unitree.emulated_quadruped import EmulatedQuadruped
 from deal_hw.drivers.unitree.rpc import Request, Response, decode_request, encode_response
 from deal_hw.errors import UnknownNameError
 from deal_hw.types import FloatArray
@@ -45,14 +46,15 @@ class SportMode:
         controller: Its stand controller.
 
     Args:
+        machine: Its gains and motor mode.
         name: The mode at power-up; "" for none.
     """
 
-    def __init__(self, name: str = "normal") -> None:
+    def __init__(self, machine: EmulatedQuadruped, name: str = "normal") -> None:
         if name and name not in SERVICE_OF:
             raise UnknownNameError("sport mode", name, SERVICE_OF)
-        self.name = name
-        self.controller = SportController()
+        self.name, self._machine = name, machine
+        self.controller = self._new_controller()
         self._release_ms: int | None = None
 
     @property
@@ -63,7 +65,7 @@ class SportMode:
     def select(self, name: str, position: FloatArray, now_ms: int) -> None:
         """Take the robot over and stand it up, from measured positions (12,)."""
         self.name, self._release_ms = name, None
-        self.controller = SportController()
+        self.controller = self._new_controller()
         self.controller.take(Posture.STANDING, position, now_ms)
 
     def release(self, now_ms: int) -> None:
@@ -76,6 +78,9 @@ class SportMode:
         due = self._release_ms is not None and now_ms >= self._release_ms
         if due and self.controller.progress(now_ms) >= 1.0:
             self.name, self._release_ms = "", None
+
+    def _new_controller(self) -> SportController:
+        return SportController(self._machine.sport, self._machine.servo_modes[0])
 
 
 class ServiceServer:

@@ -38,7 +38,7 @@ class LowCommand:
         stiffness: kp [N·m/rad].
         damping: kd [N·m·s/rad].
         effort: Feed-forward tau [N·m].
-        mode: 1 servo, 0 off.
+        mode: The servo's number (1 on a Go2), 0 off.
         level: 0xFF: to the motors themselves.
     """
 
@@ -52,9 +52,13 @@ class LowCommand:
 
 
 class LowCommandEncoder:
-    """Writes LowCommands into a buffer of its own and returns copies; one for each thread."""
+    """Writes LowCommands into a buffer of its own and returns copies; one for each thread.
 
-    def __init__(self) -> None:
+    Args:
+        servo: Mode in the slots without a motor, as the vendor's examples fill them.
+    """
+
+    def __init__(self, servo: int = MODE_SERVO) -> None:
         self._buffer = bytearray(LOW_COMMAND_BYTES)
         record = np.frombuffer(self._buffer, layout.LOW_COMMAND)[0]
         record["encapsulation"] = tuple(CDR_HEADER)
@@ -67,7 +71,7 @@ class LowCommandEncoder:
         )
         self._rows = rows[: len(JOINTS)]
         self._bytes = np.frombuffer(self._buffer, "u1")
-        self._bytes[layout.COMMAND_MODE_AT] = MODE_SERVO
+        self._bytes[layout.COMMAND_MODE_AT] = servo
         self._values = np.empty((5, len(JOINTS)))
         self._flat = self._values.reshape(-1)
         self._mode, self._level = b"", -1
