@@ -14,7 +14,8 @@ from typing import Final
 
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
 from deal_hw.drivers.g1.joints import JOINTS_23, JOINTS_29, part_of
-from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.drivers.unitree.spaces import each, joint_space
+from deal_hw.parameters import ParameterSpace
 
 WIRE_HZ: Final = 500.0
 RANGE_RAD: Final[Mapping[str, tuple[float, float]]] = {
@@ -272,24 +273,15 @@ DESCRIPTION_23: Final = _description("g1_23dof", JOINTS_23)
 
 
 def _space(joints: Sequence[str], *, bias: bool) -> ParameterSpace:
-    tables = {
-        "stiffness": ("servo_stiffness", "N·m/rad", per_joint(STIFFNESS_NM_RAD, joints)),
-        "damping": (
-            "servo_damping",
-            "N·m·s/rad",
-            tuple(kd + JOINT_DAMPING_NMS_RAD for kd in per_joint(DAMPING_NMS_RAD, joints)),
-        ),
-        "frictionloss": ("dof_frictionloss", "N·m", per_joint(FRICTIONLOSS_NM, joints)),
-        "armature": ("dof_armature", "kg·m²", (ARMATURE_KGM2,) * len(joints)),
-    }
-    parameters = [
-        Parameter.around(f"{joint}.{name}", kind, (joint,), unit, value)
-        for name, (kind, unit, values) in tables.items()
-        for joint, value in zip(joints, values, strict=True)
-    ]
-    if bias:
-        parameters += [Parameter.encoder_bias(joint, ENCODER_BIAS_RAD) for joint in joints]
-    return ParameterSpace(parameters)
+    return joint_space(
+        each(joints),
+        stiffness=per_joint(STIFFNESS_NM_RAD, joints),
+        damping=[kd + JOINT_DAMPING_NMS_RAD for kd in per_joint(DAMPING_NMS_RAD, joints)],
+        frictionloss=per_joint(FRICTIONLOSS_NM, joints),
+        armature=(ARMATURE_KGM2,) * len(joints),
+        bias=joints if bias else (),
+        bias_rad=ENCODER_BIAS_RAD,
+    )
 
 
 def parameter_space() -> ParameterSpace:

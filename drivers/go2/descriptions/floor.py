@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
-from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.drivers.unitree.spaces import Groups, gain_space
+from deal_hw.drivers.unitree.spaces import walk_space as unitree_walk_space
+from deal_hw.parameters import ParameterSpace
 
 LEGS: Final = ("FL", "FR", "RL", "RR")
 PARTS: Final = ("hip", "thigh", "calf")
@@ -39,6 +41,11 @@ GYRO_NOISE_RAD_S: Final = 0.02
 def per_joint(table: Mapping[str, float]) -> tuple[float, ...]:
     """Return a value for each of the 12 joints from one for each part of a leg."""
     return tuple(table[part] for _ in LEGS for part in PARTS)
+
+
+def by_part() -> Groups:
+    """Return the hips, the thighs and the calves."""
+    return tuple((part, tuple(f"{leg}_{part}_joint" for leg in LEGS)) for part in PARTS)
 
 
 def joint_ranges() -> tuple[tuple[float, float], ...]:
@@ -107,16 +114,7 @@ def parameter_space(stiffness: float = STIFFNESS_NM_RAD, damping: float = DAMPIN
     They are the true gains at the description's default gains. The joints' own viscous friction
     (0.6 N·m·s/rad) adds to the motor's damping and stays fixed: motion determines only their sum.
     """
-    return ParameterSpace(
-        [
-            Parameter.around(f"{joint}.{name}", kind, (joint,), unit, value)
-            for name, kind, unit, value in (
-                ("stiffness", "servo_stiffness", "N·m/rad", stiffness),
-                ("damping", "servo_damping", "N·m·s/rad", damping),
-            )
-            for joint in JOINTS
-        ]
-    )
+    return gain_space(JOINTS, stiffness, damping)
 
 
 def paper_space() -> ParameterSpace:
@@ -138,21 +136,13 @@ def walk_space() -> ParameterSpace:
 
     Dry friction is one number for all hips, one for all thighs and one for all calves.
     """
-    more = [
-        Parameter.around("base.mass", "body_mass", ("base",), "kg", TRUNK_KG, ratio=1.5),
-        Parameter.around("floor.friction", "geom_friction", ("floor",), "-", FLOOR_FRICTION, ratio=2.0),
-        *(
-            Parameter.around(
-                f"{part}s.frictionloss",
-                "dof_frictionloss",
-                tuple(f"{leg}_{part}_joint" for leg in LEGS),
-                "N·m",
-                FRICTIONLOSS_NM,
-            )
-            for part in PARTS
-        ),
-    ]
-    return ParameterSpace([*parameter_space().parameters, *more])
+    return unitree_walk_space(
+        parameter_space(),
+        by_part(),
+        trunk_kg=TRUNK_KG,
+        floor_friction=FLOOR_FRICTION,
+        frictionloss=FRICTIONLOSS_NM,
+    )
 
 
 def swapped_paper_space() -> ParameterSpace:

@@ -12,6 +12,7 @@ from typing import Final
 
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.descriptions import floor
+from deal_hw.drivers.unitree.spaces import Groups, each, joint_space
 from deal_hw.parameters import Parameter, ParameterSpace
 
 STIFFNESS_NM_RAD: Final = 20.0
@@ -46,24 +47,20 @@ DESCRIPTION: Final[RobotDescription] = dataclasses.replace(
 )
 
 
-def _space(groups: Sequence[tuple[str, tuple[str, ...]]], *, bias: bool) -> ParameterSpace:
-    rows = (
-        ("stiffness", "servo_stiffness", "N·m/rad", STIFFNESS_NM_RAD),
-        ("damping", "servo_damping", "N·m·s/rad", DAMPING_NMS_RAD + JOINT_DAMPING_NMS_RAD),
-        ("frictionloss", "dof_frictionloss", "N·m", FRICTIONLOSS_NM),
-        ("armature", "dof_armature", "kg·m²", ARMATURE_KGM2),
+def _space(groups: Groups, *, bias: Sequence[str] = ()) -> ParameterSpace:
+    count = len(groups)
+    return joint_space(
+        groups,
+        stiffness=(STIFFNESS_NM_RAD,) * count,
+        damping=(DAMPING_NMS_RAD + JOINT_DAMPING_NMS_RAD,) * count,
+        frictionloss=(FRICTIONLOSS_NM,) * count,
+        armature=(ARMATURE_KGM2,) * count,
+        bias=bias,
+        bias_rad=ENCODER_BIAS_RAD,
     )
-    parameters = [
-        Parameter.around(f"{group}.{name}", kind, elements, unit, value)
-        for name, kind, unit, value in rows
-        for group, elements in groups
-    ]
-    if bias:
-        parameters += [Parameter.encoder_bias(joint, ENCODER_BIAS_RAD) for joint in floor.JOINTS]
-    return ParameterSpace(parameters)
 
 
-_EACH: Final = tuple((joint, (joint,)) for joint in floor.JOINTS)
+_EACH: Final = each(floor.JOINTS)
 
 
 def parameter_space() -> ParameterSpace:
@@ -73,18 +70,17 @@ def parameter_space() -> ParameterSpace:
     friction (0.6 in the source's model). No recording determines the two alone. This recording hardly
     separates delay and armature: read both with the report's correlation.
     """
-    return _space(_EACH, bias=False)
+    return _space(_EACH)
 
 
 def biased_space() -> ParameterSpace:
     """Return the 48 parameters and an encoder bias of each joint, 60 in all."""
-    return _space(_EACH, bias=True)
+    return _space(_EACH, bias=floor.JOINTS)
 
 
 def shared_space() -> ParameterSpace:
     """Return 12 parameters: the same four, shared by the four hips, the four thighs and the four calves."""
-    groups = [(part, tuple(f"{leg}_{part}_joint" for leg in floor.LEGS)) for part in floor.PARTS]
-    return _space(groups, bias=False)
+    return _space(floor.by_part())
 
 
 def linkage_space() -> ParameterSpace:
