@@ -8,11 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.drivers.go2.descriptions.driver import SUPPLY
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_simulated
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.unitree.doctor import Received, UnitreeDoctor
+from deal_hw.drivers.unitree.supply import Supply
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.findings import Finding, Severity
 from deal_hw.transport import Message, TopicTransport
@@ -20,6 +22,10 @@ from deal_hw.transport import Message, TopicTransport
 
 class Go2Doctor(UnitreeDoctor[LowStateFrame]):
     """Listens to a Go2 and asks its motion switcher.
+
+    Attributes:
+        supply: Its supply, which tells it from another robot with the same messages.
+        refusals: Counts refused states.
 
     Args:
         link: A transport of topics, not opened.
@@ -30,6 +36,8 @@ class Go2Doctor(UnitreeDoctor[LowStateFrame]):
     """
 
     wording: ClassVar[Wording] = WORDING
+    supply: ClassVar[Supply] = SUPPLY
+    refusals: ClassVar[type[Refusals]] = Refusals
     kind: ClassVar[str] = "Go2"
     controller: ClassVar[str] = "sport mode"
     released: ClassVar[str] = (
@@ -49,7 +57,7 @@ class Go2Doctor(UnitreeDoctor[LowStateFrame]):
         self._strict, self._simulated = state_check == "strict", simulator != "none"
 
     def _make_refusals(self) -> Refusals:
-        return Refusals()
+        return self.refusals()
 
     def _decode(self, payload: bytes) -> LowStateFrame:
         return decode_simulated(payload) if self._simulated else decode_low_state(payload, self._strict)
@@ -80,6 +88,8 @@ class Go2Doctor(UnitreeDoctor[LowStateFrame]):
     def _judge_motors(self, frame: LowStateFrame) -> Iterator[Finding]:
         if self._simulated:
             return
+        if wrong := self.supply.complaint(frame.voltage):
+            yield Finding("robot", Severity.FAIL, wrong, "choose the robot that it is")
         charge = frame.battery_percent
         text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
         yield Finding.judged("robot", charge < 20, text, "charge it")

@@ -10,12 +10,12 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand
-from deal_hw.drivers.go2.descriptions.driver import DRIVER
+from deal_hw.drivers.go2.descriptions.driver import DRIVER, SUPPLY
 from deal_hw.drivers.go2.descriptions.leg_geometry import SUPPORT
 from deal_hw.drivers.go2.messages.body import body_state
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import LowStateFrame
-from deal_hw.drivers.go2.messages.refusals import StateCheck
+from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.transports import topics
@@ -23,9 +23,10 @@ from deal_hw.drivers.unitree.motor_command import MODE_SERVO
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.robot import SUBSCRIBED, UnitreeRobot
 from deal_hw.drivers.unitree.rpc import HEARD_TEXTS, STATUS_TEXTS, read_note
+from deal_hw.drivers.unitree.supply import Supply
 from deal_hw.drivers.unitree.support import Support, SupportConfig, SupportGuard
 from deal_hw.drivers.unitree.wording import Wording
-from deal_hw.errors import SafetyError
+from deal_hw.errors import SafetyError, WrongDeviceError
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import BodyState, FloatArray
 
@@ -58,6 +59,8 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
     bridge between robot and network reports who controls the robot, and is listened to.
 
     Attributes:
+        refusals: Counts refused states.
+        supply: Its supply, which tells it from another robot with the same messages.
         servo_mode: Mode of a motor that follows commands.
         support: The limits between floor and stand.
         other_support: The robot of deal-hw with the other support.
@@ -77,6 +80,8 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         "a bridge on the robot's side (deal-hw bridge), its own remote (damping) or its power switch"
     )
     wording: ClassVar[Wording] = WORDING
+    refusals: ClassVar[type[Refusals]] = Refusals
+    supply: ClassVar[Supply] = SUPPLY
     servo_mode: ClassVar[int] = MODE_SERVO
     support: ClassVar[SupportConfig] = SUPPORT
     other_support: ClassVar[str] = "go2_on_stand"
@@ -105,7 +110,12 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         )
 
     def _make_stream(self, check: StateCheck) -> StateStream:
-        return StateStream(check)
+        return StateStream(check, self.refusals)
+
+    def _await_robot(self) -> None:
+        super()._await_robot()
+        if self._frame is not None and (wrong := self.supply.complaint(self._frame.voltage)):
+            raise WrongDeviceError(f"{self.wording.name}: {wrong}. Nothing was sent")
 
     def _forget(self) -> None:
         super()._forget()
@@ -165,12 +175,12 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
         ours = bool(self._sender.in_force or self._armed_ns)
         if controlled and self._in_charge and not ours:
             raise SafetyError(
-                "go2: another controller commands the robot through the bridge; end the other run first "
-                "(Ctrl-C in its terminal)"
+                f"{self.wording.name}: another controller commands the robot through the bridge; end the "
+                "other run first (Ctrl-C in its terminal)"
             )
         later = message.stamp_ns - self._armed_ns > BRIDGE_DELAY_NS
         if self._armed and later and not controlled and not self._fault:
-            self._fault = f"go2: the bridge took the robot from this run: {status['reason']}"
+            self._fault = f"{self.wording.name}: the bridge took the robot from this run: {status['reason']}"
 
     def _why_unreached(self, since_ns: int) -> str:
         """Return why requests since a time [ns] do not pass the bridge; "" if nothing is known.

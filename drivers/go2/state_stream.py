@@ -15,13 +15,14 @@ class StateStream(TickStream[LowStateFrame]):
 
     Args:
         check: What a state must pass.
+        refusals: Counts refused states, and names the robot.
 
     Raises:
         UnknownNameError: There is no such check.
     """
 
-    def __init__(self, check: StateCheck = "strict") -> None:
+    def __init__(self, check: StateCheck = "strict", refusals: type[Refusals] = Refusals) -> None:
         if check not in get_args(StateCheck):
             raise UnknownNameError("check of the Go2's states", check, get_args(StateCheck))
         strict = check == "strict"
-        super().__init__("go2", lambda payload: decode_low_state(payload, strict), Refusals)
+        super().__init__(refusals.robot[0], lambda payload: decode_low_state(payload, strict), refusals)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -61,6 +62,19 @@ class TestGo2Robot(RobotSuite):
 
 
 # Connecting.
+
+
+@pytest.mark.parametrize(("volts", "refused"), [(0.0, False), (33.6, False), (math.nan, False), (50.4, True)])
+def test_a_b2_is_known_by_its_supply(volts: float, refused: bool) -> None:
+    """Its messages are the Go2's, but its 14 cells have at least 42 V; nothing is sent to it."""
+    wire = FakeBench()
+    wire.device.changes = {"voltage": volts}
+    if refused:
+        with pytest.raises(WrongDeviceError, match=r"50\.4 V.*at most 40 V.*`b2`.*Nothing was sent"):
+            wire.robot.connect()
+    else:
+        wire.robot.connect()
+    assert wire.device.received == [] and wire.device.requests == []
 
 
 def test_connecting_sends_nothing_and_learns_of_battery_and_firmware() -> None:

@@ -12,6 +12,7 @@ from typing import Final
 
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits
 from deal_hw.drivers.go2.descriptions import floor
+from deal_hw.drivers.unitree.supply import Supply
 
 WIRE_HZ: Final = 500.0
 RESTING_RAD: Final[Mapping[str, float]] = {"hip": 0.0, "thigh": 1.36, "calf": -2.65}
@@ -21,6 +22,13 @@ EFFORT_NM: Final = 23.5
 TARGET_STEP_RAD: Final = 0.6
 HELD_TILT_RAD: Final = 0.35
 """Largest tilt of a body on a stand; there a third of a leg's weight pulls it aside [rad]."""
+SUPPLY: Final = Supply(
+    kind="Go2",
+    lowest=0.0,
+    highest=40.0,
+    other="it may be a B2, which has the same messages; take robot `b2` if it is one",
+)
+"""Data sheets: 8 cells, at most 33.6 V; a B2 has 14, at least 42 V. A simulator in place of a Go2 says 0."""
 FLAIL_RAD_S: Final[Mapping[str, float]] = {"hip": 20.0, "thigh": 20.0, "calf": 10.5}
 
 LEG_LIMITS: Final = LegLimits(
