@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from deal_hw.workflows.policy import import_policy as import_policy
     from deal_hw.workflows.replay import replay as replay
     from deal_hw.workflows.running.report import RunReport as RunReport
+    from deal_hw.workflows.running.settings import B2LinkOptions as B2LinkOptions
     from deal_hw.workflows.running.settings import CraneOptions as CraneOptions
     from deal_hw.workflows.running.settings import G1LinkOptions as G1LinkOptions
     from deal_hw.workflows.running.settings import Go2LinkOptions as Go2LinkOptions
@@ -70,6 +71,7 @@ _EXPORTS = {
     "workflows.running.settings": (
         "LinkOptions",
         "Go2LinkOptions",
+        "B2LinkOptions",
         "G1LinkOptions",
         "LegOptions",
         "CraneOptions",

@@ -41,6 +41,7 @@ API_NAMES = {
     "Options of a run": (
         "LinkOptions",
         "Go2LinkOptions",
+        "B2LinkOptions",
         "G1LinkOptions",
         "CraneOptions",
         "LegOptions",

@@ -69,6 +69,7 @@ def _unitree_wires(claim: str, doctor: str, *, emulated: bool = True) -> tuple[W
 
 
 _OF_GO2: Final = "deal_hw.drivers.unitree.claim:WireClaim", "deal_hw.drivers.go2.doctor:Go2Doctor"
+_OF_B2: Final = "deal_hw.drivers.b2.robot:B2Claim", "deal_hw.drivers.b2.doctor:B2Doctor"
 _OF_G1: Final = "deal_hw.drivers.g1.robot:G1Claim", "deal_hw.drivers.g1.doctor:G1Doctor"
 
 CARTPOLE: Final = RobotEntry(
@@ -144,6 +145,24 @@ GO2_ON_STAND: Final = RobotEntry(
     simulators={"unitree_mujoco": "deal_hw.drivers.go2.unitree_mujoco:UnitreeMujocoOnStandRobot"},
     machine="go2",
 )
+B2: Final = RobotEntry(
+    name="b2",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.b2.robot:B2Robot",
+    wires=_unitree_wires(*_OF_B2),
+    recorded="deal_hw.drivers.b2.description:DESCRIPTION",
+    spaces="deal_hw.drivers.b2.description:SPACES",
+    motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
+)
+B2_ON_STAND: Final = RobotEntry(
+    name="b2_on_stand",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.b2.robot:B2OnStandRobot",
+    wires=_unitree_wires(*_OF_B2, emulated=False),
+    recorded="deal_hw.drivers.b2.description:ON_STAND",
+    spaces="deal_hw.drivers.b2.description:STAND_SPACES",
+    machine="b2",
+)
 G1: Final = RobotEntry(
     name="g1",
     api_version=API_VERSION,
@@ -216,5 +235,18 @@ SO101: Final = RobotEntry(
     environment="deal_hw/SO101-v0",
     policy="deal_hw.policies:assets/so101_udr.onnx",
 )
-ROBOTS: Final = (CARTPOLE, GO2, GO2_ON_STAND, G1, G1_23DOF, SO101, ALLEGRO, ANT, GO2_SUSPENDED, HUMANOID)
+ROBOTS: Final = (
+    CARTPOLE,
+    GO2,
+    GO2_ON_STAND,
+    B2,
+    B2_ON_STAND,
+    G1,
+    G1_23DOF,
+    SO101,
+    ALLEGRO,
+    ANT,
+    GO2_SUSPENDED,
+    HUMANOID,
+)
 """Those with a driver first: messages list them in this order."""

@@ -16,6 +16,7 @@ from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import (
+    B2RunOptions,
     CartpoleRunOptions,
     G1RunOptions,
     Go2RunOptions,
@@ -101,6 +102,11 @@ class CollectGo2Settings(Go2RunOptions, CollectLeggedSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CollectB2Settings(B2RunOptions, CollectLeggedSettings):
+    """Record a B2 during an informative motion."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CollectG1Settings(G1RunOptions, CollectSettings):
     """Record a G1 that hangs on a crane during an informative motion."""
 
@@ -124,7 +130,12 @@ class CollectSimulatedSettings(MotionOptions):
 
 
 COLLECT = robot_kinds(
-    {"cartpole": CollectCartpoleSettings, "go2": CollectGo2Settings, "g1": CollectG1Settings},
+    {
+        "cartpole": CollectCartpoleSettings,
+        "go2": CollectGo2Settings,
+        "b2": CollectB2Settings,
+        "g1": CollectG1Settings,
+    },
     plain=CollectSettings,
     legged=CollectLeggedSettings,
     simulated=CollectSimulatedSettings,

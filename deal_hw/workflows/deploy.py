@@ -12,6 +12,7 @@ from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import (
+    B2RunOptions,
     CartpoleRunOptions,
     G1RunOptions,
     Go2RunOptions,
@@ -94,6 +95,11 @@ class DeployGo2Settings(Go2RunOptions, DeployLeggedSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DeployB2Settings(B2RunOptions, DeployLeggedSettings):
+    """Run a policy on a B2 behind the safety filter, and record it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DeployG1Settings(G1RunOptions, DeploySettings):
     """Run a policy on a G1 that hangs on a crane behind the safety filter, and record it.
 
@@ -105,6 +111,7 @@ DEPLOY = robot_kinds(
     {
         "cartpole": DeployCartpoleSettings,
         "go2": DeployGo2Settings,
+        "b2": DeployB2Settings,
         "g1": DeployG1Settings,
         "so101": DeploySo101Settings,
     },

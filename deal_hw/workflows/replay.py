@@ -22,6 +22,7 @@ from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import RunReport
 from deal_hw.workflows.running.settings import (
+    B2RunOptions,
     CartpoleRunOptions,
     G1RunOptions,
     Go2RunOptions,
@@ -81,6 +82,11 @@ class ReplayGo2Settings(Go2RunOptions, ReplayLeggedSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplayB2Settings(B2RunOptions, ReplayLeggedSettings):
+    """Send a recording's commands to a B2 again, and record what happens."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReplayG1Settings(G1RunOptions, ReplaySettings):
     """Send a recording's commands to a G1 that hangs on a crane again, and record what happens."""
 
@@ -94,7 +100,12 @@ class ReplaySimulatedSettings(ReplayOptions):
 
 
 _ROBOTS = robot_kinds(
-    {"cartpole": ReplayCartpoleSettings, "go2": ReplayGo2Settings, "g1": ReplayG1Settings},
+    {
+        "cartpole": ReplayCartpoleSettings,
+        "go2": ReplayGo2Settings,
+        "b2": ReplayB2Settings,
+        "g1": ReplayG1Settings,
+    },
     plain=ReplaySettings,
     legged=ReplayLeggedSettings,
     simulated=ReplaySimulatedSettings,

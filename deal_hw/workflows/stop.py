@@ -108,6 +108,25 @@ class StopGo2Settings(StopSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class StopB2Settings(StopSettings):
+    """Make a B2 passive at once, from any terminal: damping. Nothing is asked.
+
+    A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
+    program then does it. It sends nothing while another program or the robot's own controller has the robot.
+    The exit code is 0 only if the robot confirmed that it is passive.
+    """
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """Transport to the B2."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """How to check a B2's state messages: strict (length, head and checksum), or length alone."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class StopG1Settings(StopSettings):
     """Make a G1 passive at once, from any terminal: damping. Nothing is asked. On the floor it falls.
 
@@ -124,7 +143,7 @@ class StopG1Settings(StopSettings):
 
 
 STOP = robot_kinds(
-    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings, "g1": StopG1Settings},
+    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings, "b2": StopB2Settings, "g1": StopG1Settings},
     plain=StopSettings,
     legged=StopSettings,
     example="--port {port}",
@@ -202,7 +221,11 @@ def _transport(settings: StopSettings) -> str:
 
 
 def _wire(settings: StopSettings) -> WireOptions:
-    return settings.wire if isinstance(settings, StopGo2Settings | StopG1Settings) else WireOptions()
+    return (
+        settings.wire
+        if isinstance(settings, StopGo2Settings | StopB2Settings | StopG1Settings)
+        else WireOptions()
+    )
 
 
 def _claim(settings: StopSettings) -> str:

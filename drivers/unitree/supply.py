@@ -22,7 +22,7 @@ class Supply:
     other: str
 
     def complaint(self, voltage: float) -> str:
-        """Return why a robot with this voltage [V] is not of this kind; "" if it may be or gives no number."""
+        """Return why a robot with this voltage [V] is not of this kind; "" if it may be, or does not say."""
         if not (voltage < self.lowest or voltage > self.highest):
             return ""
         bound = f"at least {self.lowest:g}" if voltage < self.lowest else f"at most {self.highest:g}"

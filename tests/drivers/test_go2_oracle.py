@@ -433,7 +433,7 @@ def random_command(seed: int) -> LowCommand:
     return LowCommand(*parts, mode=rng.integers(0, 256, 12))
 
 
-def command_message(command: LowCommand) -> LowCmd:
+def command_message(command: LowCommand, spare_mode: int = 1) -> LowCmd:
     """Return the same command for pycdr2: 12 motors in wire order, 8 with the vendor's stop values."""
     rows = zip(
         command.mode,
@@ -445,7 +445,7 @@ def command_message(command: LowCommand) -> LowCmd:
         strict=True,
     )
     listed = [MotorCmd(int(mode), *map(float, rest), [0, 0, 0]) for mode, *rest in rows]
-    spare = [MotorCmd(1, 2.146e9, 16000.0, 0.0, 0.0, 0.0, [0, 0, 0]) for _ in range(8)]
+    spare = [MotorCmd(spare_mode, 2.146e9, 16000.0, 0.0, 0.0, 0.0, [0, 0, 0]) for _ in range(8)]
     return LowCmd(
         [0xFE, 0xEF],
         0xFF,
@@ -472,6 +472,15 @@ def test_encoded_command_equals_the_oracle(seeds_: list[int]) -> None:
     for seed in seeds_:
         command = random_command(seed)
         assert encoder.encode(command) == signed(command_message(command), COMMAND_STRUCT)
+
+
+@few
+@given(seeds)
+def test_a_b2s_command_equals_the_oracle(seed: int) -> None:
+    """Motor mode 0x0A in all twenty slots, as in the vendor's example for the B2."""
+    command = dataclasses.replace(random_command(seed), mode=np.full(12, 0x0A))
+    message = command_message(command, spare_mode=0x0A)
+    assert LowCommandEncoder(0x0A).encode(command) == signed(message, COMMAND_STRUCT)
 
 
 @few

@@ -103,6 +103,26 @@ class DoctorGo2Settings(DoctorRobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DoctorB2Settings(DoctorRobotSettings):
+    """Check this computer, the connection and a B2; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+    port: str
+    """The B2's port: a network interface (dds) or an end point (zenoh)."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """Transport to the B2."""
+
+    state_check: Literal["strict", "length"] = "strict"
+    """How to check a B2's state messages: strict (length, head and checksum), or length alone."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class DoctorG1Settings(DoctorRobotSettings):
     """Check this computer, the connection and a G1; sends no command to a motor.
 
@@ -120,7 +140,12 @@ class DoctorG1Settings(DoctorRobotSettings):
 
 
 DOCTOR = robot_kinds(
-    {"cartpole": DoctorCartpoleSettings, "go2": DoctorGo2Settings, "g1": DoctorG1Settings},
+    {
+        "cartpole": DoctorCartpoleSettings,
+        "go2": DoctorGo2Settings,
+        "b2": DoctorB2Settings,
+        "g1": DoctorG1Settings,
+    },
     plain=DoctorRobotSettings,
     legged=DoctorRobotSettings,
     nothing=DoctorSettings,
@@ -191,6 +216,8 @@ def _examine_link(config: DoctorRobotSettings, name: str, clock: Clock) -> Itera
     network, own = WireOptions(), dict[str, str]()
     if isinstance(config, DoctorGo2Settings):
         network, own = config.wire, {"state_check": config.state_check, "simulator": config.simulator}
+    if isinstance(config, DoctorB2Settings):
+        network, own = config.wire, {"state_check": config.state_check}
     if isinstance(config, DoctorG1Settings):
         network = config.wire
     if wire.doctor:

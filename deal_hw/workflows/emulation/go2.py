@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
 
-TRUTHS: Final[Mapping[str, str]] = {"go2": "deal_hw.drivers.go2.emulator.truth:Go2Truth"}
+TRUTHS: Final[Mapping[str, str]] = {
+    "go2": "deal_hw.drivers.go2.emulator.truth:Go2Truth",
+    "b2": "deal_hw.drivers.b2.emulator:B2Truth",
+}
 """Hidden parameters of each quadruped: the class, as a reference."""
 TRACK_COLUMNS = ("time_s", "x", "y", "heading")
 TRACK_NS = 10_000_000

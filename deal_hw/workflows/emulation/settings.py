@@ -23,7 +23,7 @@ from deal_hw.workflows.robot_kinds import FILE
 
 @dataclass(frozen=True, kw_only=True)
 class Go2Options(Checked):
-    """Options of ``emulate go2`` alone."""
+    """Options of ``emulate go2`` and ``emulate b2``."""
 
     on_stand: bool = False
     """Hold the base in the air: no floor, no contact."""
@@ -56,12 +56,12 @@ class Go2Options(Checked):
     heading [rad]."""
 
     faults: Go2Faults = field(default_factory=Go2Faults)
-    """Faults of the Go2. Their times count from the first stiff command."""
+    """Faults of the robot. Their times count from the first stiff command."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EmulatorWireOptions(NetworkOptions):
-    """How an emulated Go2 joins its network, beyond the port."""
+    """How an emulated robot of Unitree joins its network, beyond the port."""
 
     mode: Literal["peer", "client"] = "peer"
     """Zenoh: peer waits for peers at the port, client connects to the router there."""
@@ -103,7 +103,7 @@ class EmulateSettings(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Hidden parameters lie within this factor of the nominal ones; by default 5 for the cart-pole, 2 for the
-    Go2, 1.5 for the G1 and an arm."""
+    Go2 and the B2, 1.5 for the G1 and an arm."""
 
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
@@ -260,10 +260,15 @@ class EmulateGo2Settings(EmulateSettings):
     default reachable on this machine only."""
 
     go2: Go2Options = field(default_factory=Go2Options)
-    """Options of the Go2 alone."""
+    """Options of a robot with four legs."""
 
     wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
     """How it joins its network."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateB2Settings(EmulateGo2Settings):
+    """Emulate a B2 in real time on its own network, with hidden physics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -307,6 +312,7 @@ class EmulateG1Settings(EmulateSettings):
 _SETTINGS: dict[str, type[EmulateSettings]] = {
     "cartpole": EmulateCartpoleSettings,
     "go2": EmulateGo2Settings,
+    "b2": EmulateB2Settings,
     "g1": EmulateG1Settings,
     "g1_23dof": EmulateG1Settings,
     "so101": EmulateArmSettings,

@@ -26,14 +26,15 @@ class StandOptions:
     recording that did both is replayed without."""
 
     hand_back: bool = False
-    """Return the robot to its own controller at the end (Go2: the sport service)."""
+    """Return the robot to its own controller at the end (Go2 and B2: the sport service)."""
 
     stop_buttons: str = ""
     """Buttons of the robot's remote that, held together, make the robot passive; by default the driver's
-    (Go2: L2+B)."""
+    (Go2 and B2: L2+B)."""
 
     support_check: bool = True
-    """Refuse a go2 on a stand and a go2_on_stand on the floor. Switch off only to try a policy in the air."""
+    """Refuse a go2 or b2 on a stand, and a go2_on_stand or b2_on_stand on the floor. Switch off only to try a
+    policy in the air."""
 
     posture: PostureConfig = field(default_factory=PostureConfig)
     """Durations of standing up and lying down."""
@@ -75,22 +76,27 @@ class CartpoleLinkOptions(LinkOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Go2LinkOptions(LinkOptions):
-    """The connection to a Go2, beyond the port."""
+class B2LinkOptions(LinkOptions):
+    """The connection to a B2, beyond the port."""
 
     transport: Literal["dds", "zenoh"] = "dds"
     """The transport."""
 
     state_check: Literal["strict", "length"] = "strict"
-    """How to check a Go2's state messages: strict (length, head and checksum), or length alone, for firmware
-    or simulators with another head or checksum. With length alone corrupted states are not detected."""
+    """How to check the state messages: strict (length, head and checksum), or length alone, for firmware or
+    simulators with another head or checksum. With length alone corrupted states are not detected."""
+
+    wire: WireOptions = field(default_factory=WireOptions)
+    """Network options."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Go2LinkOptions(B2LinkOptions):
+    """The connection to a Go2, beyond the port."""
 
     simulator: Literal["none", "unitree_mujoco"] = "none"
     """The simulator that runs in place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and
     battery. A real robot is then refused."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +171,18 @@ class Go2RunOptions(RunOptions):
     tcp/127.0.0.1:7447 (zenoh)."""
 
     link: Go2LinkOptions = field(default_factory=Go2LinkOptions)
+    """The connection to the robot, beyond the port."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class B2RunOptions(RunOptions):
+    """Options of every verb that runs a B2."""
+
+    port: str
+    """The robot's port: a network interface such as enp2s0 (dds), or an end point such as
+    tcp/127.0.0.1:7447 (zenoh)."""
+
+    link: B2LinkOptions = field(default_factory=B2LinkOptions)
     """The connection to the robot, beyond the port."""
 
 
@@ -266,7 +284,7 @@ def plan_options(
         "record_wire": link.record_wire,
         "robot_settings": _settings(link, legs, crane),
     }
-    if isinstance(link, Go2LinkOptions | G1LinkOptions):
+    if isinstance(link, B2LinkOptions | G1LinkOptions):
         options["wire"] = link.wire
     if legs is None:
         return {**options, "stand": False}
@@ -292,7 +310,8 @@ def _settings(link: LinkOptions, legs: StandOptions | None, crane: CraneOptions 
     own: tuple[tuple[Any, Any, tuple[str, ...]], ...] = (
         (legs, StandOptions, ("stop_buttons", "support_check")),
         (crane, CraneOptions, ("stop_buttons", "hung_on_crane")),
-        (link, Go2LinkOptions, ("state_check", "simulator")),
+        (link, B2LinkOptions, ("state_check",)),
+        (link, Go2LinkOptions, ("simulator",)),
     )
     return {
         name: getattr(options, name)
