@@ -32,10 +32,12 @@ LINES = (
     "collect cartpole --port p --out o --motion hold",
     "collect go2 --port lo --out o --motion hold",
     f"collect go2_on_stand {ZENOH} --out o",
+    "collect b2 --port lo --out o --motion hold",
     "collect g1 --port lo --out o --motion hold",
     "deploy cartpole --port p",
     "deploy cartpole --port p --out o --dry-run",
     "deploy go2 --port lo",
+    "deploy b2 --port lo --policy walk.onnx",
     f"deploy g1_23dof {ZENOH} --policy walk.onnx",
     f"deploy go2 {ZENOH} --no-record",
     "replay e --port p",
@@ -45,6 +47,7 @@ LINES = (
     "doctor",
     "doctor cartpole --port p",
     "doctor go2 --port lo",
+    "doctor b2 --port lo",
     "doctor g1 --port lo",
     f"doctor go2 {ZENOH} --simulator unitree_mujoco",
 )
@@ -162,6 +165,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(examine, "examine_machine", lambda: iter(()))
     monkeypatch.setattr(examine, "judge_interfaces", lambda port: iter(()))
     monkeypatch.setattr("deal_hw.drivers.go2.doctor.Go2Doctor", Listener)
+    monkeypatch.setattr("deal_hw.drivers.b2.doctor.B2Doctor", Listener)
     monkeypatch.setattr("deal_hw.drivers.g1.doctor.G1Doctor", Listener)
     return did
 

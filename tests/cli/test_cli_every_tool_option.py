@@ -61,6 +61,7 @@ LINES = (
     "emulate cartpole --transport dynamixel",
     "emulate go2",
     "emulate go2 --transport zenoh --port tcp/127.0.0.1:7447",
+    "emulate b2",
     "emulate g1",
     "emulate g1 --transport zenoh --port tcp/127.0.0.1:7447",
     "bridge go2 --port lo",
@@ -343,6 +344,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     )
     for wire in robot_entry("cartpole").wires:
         monkeypatch.setattr(str(wire.emulator).replace(":", "."), note("emulator", emulator))
+    from deal_hw.drivers.b2.emulator import B2Truth
     from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.g1.emulator.truth import nominal_truth as nominal_g1
     from deal_hw.drivers.go2.emulator.truth import Go2Truth
@@ -353,7 +355,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     ):
         drawn = note("drawn", truth("sensor", 0))
         monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
-    for quadruped in (Go2Truth,):
+    for quadruped in (Go2Truth, B2Truth):
         monkeypatch.setattr(quadruped, "draw", note("drawn", quadruped.nominal("sensor", 0)))
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
     monkeypatch.setattr("deal_hw.drivers.go2.emulator.device.Go2Device", note("device", device))

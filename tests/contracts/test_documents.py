@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from deal_hw.calibration import CalibrationResult
 from deal_hw.control.loop.timing import LoopTimingReport, Spread
+from deal_hw.drivers.b2.emulator import B2Truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
 from deal_hw.drivers.g1.emulator.truth import G1Truth
@@ -80,6 +81,10 @@ DOCUMENTS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "truth of a cart-pole": (
         nominal_cartpole("realistic", 3, sensing_ticks=2).to_json(),
         lambda values: CartpoleTruth.from_json(values).to_json(),
+    ),
+    "truth of a B2": (
+        B2Truth.draw("realistic", 5).to_json(),
+        lambda values: B2Truth.from_json(values).to_json(),
     ),
     "truth of a G1": (
         draw_g1("realistic", 5).to_json(),

@@ -39,6 +39,10 @@ SIZES = {
     ("cartpole", "k9"): 9,
     ("cartpole", "k11"): 11,
     ("cartpole", "paper"): 11,
+    ("b2", "default"): 24,
+    ("b2", "walk"): 29,
+    ("b2_on_stand", "default"): 48,
+    ("b2_on_stand", "biased"): 60,
     ("g1", "default"): 116,
     ("g1", "biased"): 145,
     ("g1_23dof", "default"): 92,
@@ -328,7 +332,8 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
         with pytest.raises(ConfigurationError, match=f"{name!r}.*no driver yet.*cartpole"):
             make_robot(name, "serial", "x", MonotonicClock())
     with pytest.raises(
-        UnknownNameError, match=r"cartpole, go2, go2_on_stand, g1, g1_23dof, so101, allegro, ant"
+        UnknownNameError,
+        match=r"cartpole, go2, go2_on_stand, b2, b2_on_stand, g1, g1_23dof, so101, allegro, ant",
     ):
         robot_description("gotwo")
     with pytest.raises(UnknownNameError, match="go2_suspended"):
