@@ -152,6 +152,8 @@ B2: Final = RobotEntry(
     wires=_unitree_wires(*_OF_B2),
     recorded="deal_hw.drivers.b2.description:DESCRIPTION",
     spaces="deal_hw.drivers.b2.description:SPACES",
+    odometry="deal_hw.drivers.b2.odometry:walked",
+    sway="deal_hw.drivers.go2.motions:sway_plan",
     motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
 )
 B2_ON_STAND: Final = RobotEntry(

@@ -34,9 +34,9 @@ STANDING_RAD: Final = {"hip": 0.0, "thigh": 0.8, "calf": -1.5}
 RESTING_RAD: Final = {"hip": 0.0, "thigh": 1.36, "calf": -2.65}
 REACH_RAD: Final = {"hip": 0.2, "thigh": 0.4, "calf": 0.5}
 """Largest distance of excitations from the standing pose on a stand."""
-STIFFNESS_NM_RAD, DAMPING_NMS_RAD = 300.0, 10.0
+STIFFNESS_NM_RAD, DAMPING_NMS_RAD = 500.0, 10.0
 STAND_STIFFNESS_NM_RAD, STAND_DAMPING_NMS_RAD = 160.0, 5.0
-HIGHEST_STIFFNESS_NM_RAD: Final = 500.0
+HIGHEST_STIFFNESS_NM_RAD: Final = 1000.0
 HIGHEST_DAMPING_NMS_RAD: Final = 10.0
 JOINT_DAMPING_NMS_RAD: Final = 1.0
 FRICTIONLOSS_NM: Final = 1.5
@@ -49,7 +49,9 @@ TRIP_MARGIN_RAD: Final = 0.15
 HELD_TILT_RAD: Final = 0.35
 """Largest tilt of a body on a stand [rad]."""
 
-GEOMETRY: Final = LegGeometry(link_m=0.35, side_m=0.11973, hip_m=(0.3285, 0.072), weight_n=732.0)
+GEOMETRY: Final = LegGeometry(
+    link_m=0.35, side_m=0.11973, foot_m=0.032, hip_m=(0.3285, 0.072), weight_n=732.0
+)
 """Legs as in ``assets/b2.xml``; the weight is that of its 74.6 kg."""
 SUPPORT: Final = SupportConfig(legs=GEOMETRY, level_rad=HELD_TILT_RAD, held_reach_m=0.26, lying_reach_m=0.205)
 """The Go2's limits between floor and stand, times 1.64, the ratio of the legs. Feet of a robot that lies in
@@ -91,7 +93,7 @@ def _limits(legs: LegLimits) -> SafetyLimits:
     return SafetyLimits(
         target=tuple((low + margin, high - margin) for low, high in ranges),
         target_step=(0.46,) * count,
-        target_distance=(0.6,) * count,
+        target_distance=(0.4,) * count,
         trip_position=tuple((low - TRIP_MARGIN_RAD, high + TRIP_MARGIN_RAD) for low, high in ranges),
         trip_velocity=per_joint(VELOCITY_LIMIT_RAD_S),
         stiffness=(HIGHEST_STIFFNESS_NM_RAD,) * count,
@@ -110,8 +112,8 @@ SOURCES: Final[Mapping[str, str]] = {
     "joint_names": "unitree_ros @ d6f13aa, b2_description.urdf; model order",
     "default_position": "rl_sar @ 0c40ba5, policy/b2/base.yaml: hip 0, thigh 0.8, calf -1.5",
     "stiffness": (
-        "between what deployed B2 policies use (unitree_rl_lab 160, rl_sar 200 to 300) and the 1000 of the "
-        "vendor's stand example: with 300 a standing robot sags by 0.15 rad"
+        "own: half of the 1000 of the vendor's stand example. With 300, the most that deployed policies use "
+        "(unitree_rl_lab 160, rl_sar 200 to 300), 4 of 6 emulated robots that only stand fall over"
     ),
     "damping": "kd of the vendor's stand example; deployed policies use 3 to 5",
     "effort_limit": (
@@ -129,7 +131,7 @@ SOURCES: Final[Mapping[str, str]] = {
     "rest_position": "unitree_sdk2 @ 21d0a3b, b2_stand_example.cpp: hip 0, thigh 1.36, calf -2.65",
     "limits": (
         "ranges and speeds (23, 14 rad/s) of the same URDF; measured positions may be 0.15 rad outside, as "
-        "on a Go2; highest stiffness assumed: half of the vendor's stand example"
+        "on a Go2; highest gains are those of the vendor's stand example"
     ),
     "target_step": "motion of a hip or thigh at its top speed, 23 rad/s, in a control period of 20 ms",
     "silence_s": "assumed: ten control periods; the robot holds its last target meanwhile",

@@ -1,4 +1,4 @@
-"""Motions that excite a standing Go2 without moving its feet."""
+"""Motions that excite a standing Go2 or B2 without moving its feet."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION
 from deal_hw.motions.excitation.limits import fit_to_limits
 from deal_hw.motions.excitation.plan import ExcitationPlan
 from deal_hw.motions.excitation.waveforms import Steps
@@ -31,12 +30,12 @@ def sway(
     """Return a behaviour that sways the body in all six directions over standing feet.
 
     Args:
-        robot: The Go2's model.
+        robot: The robot's model.
         rng: Draws frequencies and phases.
         seconds: Length [s].
         band_hz: Lowest and highest frequency [Hz].
     """
-    rate = DESCRIPTION.control_rate_hz
+    rate = robot.description.control_rate_hz
     time = np.arange(round(seconds * rate) + 2) / rate
     low, high = band_hz
     frequency = np.exp(rng.uniform(np.log(low), np.log(high), (6, _TONES)))
@@ -44,7 +43,7 @@ def sway(
     waves = np.sin(2 * np.pi * frequency * time[:, None, None] + phase).mean(axis=2)
     # Starts from rest: a step of the targets could throw the robot over.
     moved = np.minimum(time / EASE_S, 1.0)[:, None] * waves * (*SHIFT_M, *TURN_RAD)
-    pose = np.array(DESCRIPTION.default_position)
+    pose = np.array(robot.description.default_position)
     targets = standing_targets(robot, FEET, moved[:, :3], moved[:, 3:], pose)
 
     def behaviour(position: FloatArray, velocity: FloatArray, at_s: float) -> FloatArray:
@@ -63,7 +62,7 @@ def sway_plan(
     """Return the same as a table of targets, which the robot's computer plays without a simulator.
 
     Args:
-        robot: The Go2's model, with the description that the plan is for.
+        robot: The robot's model, with the description that the plan is for.
         rng: Draws frequencies and phases.
         seconds: Length [s].
         band_hz: Lowest and highest frequency [Hz].

@@ -24,12 +24,14 @@ class LegGeometry:
     Attributes:
         link_m: Length of a thigh, and of a calf up to the foot's centre [m].
         side_m: Distance from the axis of a hip joint to its leg's plane [m].
+        foot_m: Radius of a foot [m].
         hip_m: Place of the front left hip joint in the base's frame, ahead and to the left [m].
         weight_n: Weight of the robot [N].
     """
 
     link_m: float
     side_m: float
+    foot_m: float
     hip_m: tuple[float, float]
     weight_n: float
 

@@ -218,9 +218,9 @@ def test_swaying_is_planned_for_the_driven_robot_and_keeps_its_limits(tmp_path: 
     assert np.abs(np.diff(targets, axis=0)).max() < np.array(DRIVER.limits.target_step).min()
 
 
-def test_only_the_go2_sways(tmp_path: Path) -> None:
+def test_only_robots_on_their_feet_sway(tmp_path: Path) -> None:
     """A suspended robot has no standing feet."""
-    with pytest.raises(ConfigurationError, match=r"stand on feet \(go2\)"):
+    with pytest.raises(ConfigurationError, match=r"stand on feet \(go2, b2\)"):
         design_excitation(
             DESIGN_EXCITATION.settings(
                 robot="go2_on_stand", out=tmp_path / "x.json", family="sway", quiet=True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -12,7 +13,12 @@ import numpy as np
 import pytest
 from fakes.go2 import FakeBench
 
+from deal_hw.clock import VirtualClock
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import make_passive
+from deal_hw.control.safety.safety import Safety
+from deal_hw.data.recording.record import CycleRecord
 from deal_hw.description import LegLimits, RobotDescription
 from deal_hw.drivers.b2.description import (
     DESCRIPTION,
@@ -27,13 +33,20 @@ from deal_hw.drivers.b2.doctor import B2Doctor
 from deal_hw.drivers.b2.emulator import B2, B2Truth
 from deal_hw.drivers.b2.robot import B2Claim, B2OnStandRobot, B2Robot
 from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS
+from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.wire import SLOT, WIRE_JOINTS
+from deal_hw.drivers.go2.motions import sway_plan
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.unitree.support import Support, read_support
 from deal_hw.errors import ConfigurationError, SafetyError, WrongDeviceError
 from deal_hw.findings import Severity
+from deal_hw.motions.behaviours import HoldBehaviour
+from deal_hw.motions.excitation.waveforms import Steps
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.robots import robot_entry
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.types import FloatArray
@@ -373,3 +386,61 @@ def test_doctor_names_another_robot_by_its_states() -> None:
     )
     found = list(B2Doctor(wire.topics, wire.clock, 1.0).run())
     assert any("no B2 states" in finding.seen and "G1" in finding.do for finding in found)
+
+
+# Motions.
+
+
+def test_a_standing_b2_sways_over_its_feet() -> None:
+    """Targets stay inside the limits, every joint moves, and no foot moves against another by 5 mm."""
+    plan = sway_plan(load_model(DESCRIPTION), np.random.default_rng(1), 2.0)
+    assert plan.robot == "b2" and isinstance(plan.wave, Steps)
+    targets = np.array(DESCRIPTION.default_position) + np.array(plan.wave.value)
+    low, high = np.array(DESCRIPTION.limits.target).T
+    assert ((low <= targets) & (targets <= high)).all()
+    assert np.ptp(targets, axis=0).min() > 0.02
+    feet = GEOMETRY.foot_positions(targets)
+    apart = np.linalg.norm(feet[:, :, None] - feet[:, None, :], axis=-1)
+    assert np.ptp(apart, axis=0).max() < 0.005
+
+
+def test_a_standing_robot_stays_where_it_is_by_its_own_sensors(make_b2: Any) -> None:
+    """The path of a B2 that stands for a second: less than a centimetre, by the legs of a B2."""
+    bench = make_b2(truth=B2Truth.nominal("sensor", 1), sport="normal", start="standing")
+    frames = bench.run(1000)
+
+    def stacked(*names: str) -> SimpleNamespace:
+        return SimpleNamespace(**{name: np.stack([getattr(one, name) for one in frames]) for name in names})
+
+    recording = stacked("position", "velocity", "effort", "orientation", "angular_velocity", "specific_force")
+    recording.body = recording
+    recording.acceleration = recording.specific_force
+    recording.device_s = np.array([one.tick_ms for one in frames]) * 1e-3
+    entry = robot_entry("b2")
+    track = entry.load(entry.odometry)(recording)
+    assert np.abs(track.place).max() < 0.01
+
+
+# A run.
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_run_stands_up_holds_and_lies_down(seed: int) -> None:
+    """Released from sport mode, behind the safety filter, with hidden payload and friction; then damped."""
+    clock = VirtualClock(10**9)
+    device = Go2Device(B2Truth.draw("realistic", seed), sport="ai", start="standing")
+    robot = B2Robot(VirtualTopics(device, clock), clock)
+    hold = PostureBehaviour(HoldBehaviour(DESCRIPTION), DESCRIPTION, 1.0, PostureConfig())
+    heights: list[float] = []
+
+    def note(record: CycleRecord) -> bool:
+        heights.append(device.base_height)
+        return True
+
+    config = LoopConfig(duration_s=hold.longest_s)
+    report = ControlLoop(robot, hold, Safety(DESCRIPTION), clock, note, config, end=hold.end).run()
+    assert report.outcome is Outcome.FINISHED, report.reason
+    # Links of 0.35 m at 0.8 and -0.7 rad, less what springs of 500 N·m/rad give under the weight.
+    assert 0.45 < max(heights) < 0.35 * (math.cos(0.8) + math.cos(0.7)) + 0.032
+    assert heights[-1] < 0.15 and device.log.to_json()["last_kind"] == "damping"
+    assert device.sport_name == ""
