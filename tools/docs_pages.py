@@ -36,7 +36,8 @@ ALARM_FOLDERS = ("calib", "deal_hw")
 
 API_NAMES = {
     "Calibrate": ("calibrate", "Calibration", "design_excitation"),
-    "Run a robot": ("collect", "deploy"),
+    "Record a robot": ("collect",),
+    "Run a robot": ("deploy",),
     "Replay a recording": ("replay", "RunReport"),
     "Options of a run": (
         "LinkOptions",

@@ -59,8 +59,8 @@ the vendor's rest pose reach 0.17 m."""
 SUPPLY: Final = Supply(
     kind="B2",
     lowest=40.0,
-    highest=math.inf,
-    other="it may be a Go2, which has the same messages; take robot `go2` if it is one",
+    highest=60.0,
+    other="it may be a Go2 or an H1, which have the same messages; take robot `go2` if it is a Go2",
 )
 """14 cells, 58.8 V when charged; a Go2 has at most 33.6 V."""
 

@@ -260,7 +260,7 @@ def stand_example(start: FloatArray, mode: int) -> Iterator[bytes]:
     parts = ((start, lying, 500), (lying, up, 900), (up, up, 1000), (up, lying, 1100), (lying, spread, 500))
     for begin, end, count in parts:
         for share in np.arange(1, count + 1) / count:
-            yield frame((1.0 - share) * begin + share * end, mode)
+            yield frame(np.asarray((1.0 - share) * begin + share * end), mode)
 
 
 def test_a_frame_has_what_the_vendors_example_fills_in() -> None:
