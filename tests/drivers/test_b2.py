@@ -281,7 +281,7 @@ def test_motors_have_the_vendors_order() -> None:
         "FL_calf_joint",
         "RL_calf_joint",
     )
-    pose = np.arange(12) * 0.01
+    pose = np.linspace(0.0, 0.11, 12)
     decoded = decode_low_command(frame(pose)).position
     for joint, value in zip(WIRE_JOINTS, pose, strict=True):
         assert decoded[JOINTS.index(joint)] == pytest.approx(value, rel=1e-6)
