@@ -182,7 +182,8 @@ def test_wrong_options_are_refused_before_anything_opens() -> None:
         EMULATE.settings(robot="go2", transport="serial")
     with pytest.raises(UnknownNameError, match="robot to emulate 'spot'; known: cartpole, go2"):
         EMULATE.settings(robot="spot")
-    with pytest.raises(UnknownNameError, match=r"settings cartpole 'go2'; .*`settings go2` has it"):
+    both = r"settings cartpole 'go2'; .*`settings go2` and `settings b2` have it"
+    with pytest.raises(UnknownNameError, match=both):
         EMULATE.settings(go2=Go2Options(on_stand=True, faults=Go2Faults(push=5.0)))
     with pytest.raises(ConfigurationError, match="--tick-start-ms -1 ms: allowed are 0 to 4294967295 ms"):
         Go2Options(tick_start_ms=-1)
