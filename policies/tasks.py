@@ -166,7 +166,7 @@ GO2: Final = _go2("go2_env:Go2Env")
 CANTER: Final = _go2("canter_env:CanterEnv", ppo=_CANTER_PPO)
 """The Go2's canter; the shipped policy was trained in two stages, see docs/how-to/go2-gaits.md."""
 CLIMB: Final = _go2("climb_env:ClimbEnv", ppo=_CLIMB_PPO)
-"""The Go2's climb onto a platform; the shipped policy had a tenth of these steps."""
+"""The Go2's climb onto a platform; the shipped policy had a third of these steps."""
 HUMANOID: Final = _simulated(
     "humanoid_env:HumanoidEnv", motors=21, udr_ratio=1.75, ppo=_STRIDE_PPO, members=128
 )

@@ -133,6 +133,7 @@ GO2: Final = RobotEntry(
     policies={
         "canter": "deal_hw.policies:assets/go2_canter.onnx",
         "climb": "deal_hw.policies:assets/go2_climb.onnx",
+        "climb_rma": "deal_hw.policies:assets/go2_climb_rma.onnx",
     },
     motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
 )

@@ -127,7 +127,7 @@ class RobotEntry:
         environment: Gymnasium's name of the task, such as ``"deal_hw/Ant-v0"``.
         policy: The shipped policy, ``"package:file"``.
         tasks: Further training tasks, as ``task``, by name.
-        policies: Their shipped policies, as ``policy``, by the task's name.
+        policies: Further shipped policies, as ``policy``: those of these tasks by their names, and others.
         motors: The joints in the order of the vendor's motor numbers, by which policies of other trainers
             name them.
         needs: What pip installs for it; named where an import fails.

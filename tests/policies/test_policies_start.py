@@ -96,6 +96,32 @@ def test_the_shipped_policies_of_further_tasks_belong_to_their_records(task: str
         assert 0.04 <= policy.spec.training[CLIMBED] <= 0.22
 
 
+def test_the_shipped_climb_with_adaptation_belongs_to_its_record() -> None:
+    """It observes the climb's own terms and their history, and a training may start from its checkpoint."""
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+    from deal_hw.policies.rma import RmaConfig, RmaTrainer
+
+    path = required_policy("go2", "climb_rma")
+    policy = OnnxPolicy(path)
+    record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    assert record["onnx_sha256"] == policy.digest and record["spec_digest"] == policy.spec.digest()
+    assert (
+        policy.spec.training["algorithm"] == "rma" and 0.0 < policy.spec.training["encoding_not_felt"] < 0.8
+    )
+    env = climb(2)
+    learner = RmaTrainer().learner(env, RmaConfig())
+    assert policy.spec.observation == env.layout.observation
+    found = learner.read(path.with_suffix(".safetensors"), env.layout)
+    learner.load(found, whole=False)
+    assert found.notes["same_task"] and path.stat().st_size < 1_000_000
+    seen = np.random.default_rng(0).standard_normal((5, len(env.layout.observation))).astype(np.float32)
+    import torch
+
+    with torch.no_grad():
+        mine = learner.network()(torch.as_tensor(seen)).numpy()
+    np.testing.assert_allclose(mine, policy.act_batch(seen), atol=1e-4)
+
+
 def test_a_policy_is_a_file_or_a_task(tmp_path: Path) -> None:
     """A file of the name comes first; a name that is neither is a file that is missing."""
     assert policy_file("go2", None) == required_policy("go2")
