@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -275,10 +275,15 @@ class PpoLearner:
     def network(self) -> torch.nn.Module:
         """Return the actor without exploration, as layers, on the CPU from now on."""
         self._actor.cpu()
-        self._feedback.cpu()
-        if not self._feedback.weight.any():
-            return torch.nn.Sequential(*self._actor.mlp, torch.nn.Hardtanh())
-        return FeedbackNetwork(torch.nn.Sequential(*self._actor.mlp), self._feedback)
+        layers, gain = self._layers(), self._env.feedback()
+        if not gain.any():
+            return torch.nn.Sequential(*layers, torch.nn.Hardtanh())
+        return FeedbackNetwork(torch.nn.Sequential(*layers), Feedback(gain))
+
+    def _layers(self) -> Iterable[torch.nn.Module]:
+        """Return the layers of the whole observation, on the CPU."""
+        layers: torch.nn.Sequential = self._actor.mlp
+        return layers
 
     def checkpoint(self) -> Checkpoint:
         """Return the state needed to continue."""

@@ -24,7 +24,7 @@ from tensordict import TensorDict
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint
-from deal_hw.policies.network_policy import AdaptedNetwork, Feedback, FeedbackNetwork
+from deal_hw.policies.network_policy import AdaptedNetwork, Feedback
 from deal_hw.policies.ppo import PpoConfig, PpoLearner, PpoTrainer
 from deal_hw.policies.vector_env import ServoVectorEnv, TaskKnowledge
 from deal_hw.policy import MAX_DELAY, Observation, PolicySpec
@@ -129,17 +129,6 @@ class _RmaLearner(PpoLearner):
             return super().update(check)
         return self._adapt(check)
 
-    def network(self) -> torch.nn.Module:
-        """Return policy and adaptation module as one network of the whole observation, on the CPU."""
-        self._actor.cpu()
-        adaptation = torch.nn.Sequential(*self._adaptation.cpu())
-        policy, own = torch.nn.Sequential(*self._actor.mlp), self._env.own_terms
-        feedback = self._env.feedback()
-        if not feedback.any():
-            bounded = torch.nn.Sequential(*policy, torch.nn.Hardtanh())
-            return AdaptedNetwork(bounded, adaptation, own)
-        return FeedbackNetwork(AdaptedNetwork(policy, adaptation, own), Feedback(feedback))
-
     def checkpoint(self) -> Checkpoint:
         """Return the state needed to continue."""
         found = super().checkpoint()
@@ -202,6 +191,10 @@ class _RmaLearner(PpoLearner):
             tensors[name] = _by_name(tensors[name], begin, list(sizes), names)
         self._size |= {name: size for name, size in sizes.items() if name in self._size}
         super()._load_networks(Checkpoint(tensors=tensors, notes=found.notes, path=found.path), whole)
+
+    def _layers(self) -> list[torch.nn.Module]:
+        policy = torch.nn.Sequential(*self._actor.mlp)
+        return [AdaptedNetwork(policy, self._adaptation.cpu(), self._env.own_terms)]
 
     def _parts(self) -> dict[str, torch.nn.Module]:
         return {**super()._parts(), "adaptation": self._adaptation}

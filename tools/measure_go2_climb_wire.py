@@ -17,12 +17,11 @@ from pathlib import Path
 
 from measuring import Row, Rows, add_seeds, parser
 
+from deal_hw.cli.demo_go2 import CLIMB_M_S, CLIMB_S, PORTS
 from deal_hw.workflows.emulation.go2 import read_track
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
-PORTS = {"zenoh": "tcp/127.0.0.1:0", "dds": "lo"}
 EDGE_M, BEYOND_M = 1.0, 0.5
-SECONDS, AHEAD_M_S = 6.0, 0.6
 LONGEST_S = 120.0
 
 
@@ -47,8 +46,8 @@ def measure(policy: str, wire: str, height: float, seed: int, *, blind: bool) ->
             done = subprocess.run(
                 [
                     *(sys.executable, "-m", "deal_hw", "deploy", "go2", "--transport", wire),
-                    *("--port", emulator.port, "--policy", policy, "--seconds", f"{SECONDS:g}"),
-                    *("--velocity", f"{AHEAD_M_S:g},0,0", "--out", str(Path(place) / "run")),
+                    *("--port", emulator.port, "--policy", policy, "--seconds", f"{CLIMB_S:g}"),
+                    *("--velocity", f"{CLIMB_M_S:g},0,0", "--out", str(Path(place) / "run")),
                     *(() if blind else ("--obstacle", f"{EDGE_M:g},{height:g}")),
                 ],
                 input="y\n",

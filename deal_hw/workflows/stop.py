@@ -66,7 +66,7 @@ class StopSettings(Checked):
             names = [
                 name for name in ("transport", "seconds", "state_check", "simulator") if hasattr(kind, name)
             ]
-            wire = given(getattr(self, "wire", None) or WireOptions(), WireOptions())
+            wire = given(_wire(self), WireOptions())
             refuse(
                 [*given(self, kind, names), *wire], "without --port only runs on this computer are stopped"
             )
@@ -221,11 +221,9 @@ def _transport(settings: StopSettings) -> str:
 
 
 def _wire(settings: StopSettings) -> WireOptions:
-    return (
-        settings.wire
-        if isinstance(settings, StopGo2Settings | StopB2Settings | StopG1Settings)
-        else WireOptions()
-    )
+    """Return the network options; the usual ones of a robot that has none."""
+    wire: WireOptions | None = getattr(settings, "wire", None)
+    return wire or WireOptions()
 
 
 def _claim(settings: StopSettings) -> str:

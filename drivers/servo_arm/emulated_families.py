@@ -28,7 +28,13 @@ ABSENT, RESTARTS, OVERLOAD = TROUBLES = ("servo absent", "servo restarts", "over
 
 
 class EmulatedJoint(abc.ABC):
-    """A servo on a joint: what it was told, and what it measures."""
+    """A servo on a joint: what it was told, and what it measures.
+
+    Attributes:
+        servo: The emulated servo.
+    """
+
+    servo: EmulatedServo | StsServo
 
     @property
     @abc.abstractmethod
@@ -73,17 +79,27 @@ class EmulatedJoint(abc.ABC):
     def tick(self, now_ns: int, silence_ns: int) -> None:
         """Advance its clock."""
 
+    @property
     @abc.abstractmethod
+    def overloaded(self) -> bool:
+        """Whether it reports an overload."""
+
     def trouble(self, now_ns: int) -> str:
         """Return its fault at a time [ns], one of :data:`TROUBLES`; "" for none."""
+        if not self.servo.present:
+            return ABSENT
+        if not self.servo.awake(now_ns):
+            return RESTARTS
+        return OVERLOAD if self.overloaded else ""
 
-    @abc.abstractmethod
     def restart(self, now_ns: int) -> None:
         """Restart at a time [ns], as after a dip of its supply."""
+        self.servo.reboot(now_ns)
 
-    @abc.abstractmethod
     def unplug(self, now_ns: int) -> None:
         """Take its supply and its data away at a time [ns]."""
+        self.servo.reboot(now_ns)
+        self.servo.present = False
 
     @abc.abstractmethod
     def overload(self) -> None:
@@ -98,6 +114,8 @@ class DynamixelJoint(EmulatedJoint):
         baud_rate: Rate of the bus.
         model: Its model number.
     """
+
+    servo: EmulatedServo
 
     def __init__(self, servo: int, baud_rate: int, model: int) -> None:
         self.servo = EmulatedServo(servo, baud_rate, mode=OperatingMode.POSITION, model=model)
@@ -141,18 +159,10 @@ class DynamixelJoint(EmulatedJoint):
         """Advance its clock and its watchdog."""
         self.servo.tick(now_ns, silence_ns)
 
-    def trouble(self, now_ns: int) -> str:
-        """Return its fault at a time [ns]."""
-        return _trouble(self.servo, now_ns, self.servo.get(r.HARDWARE_ERROR) & OVERLOAD_ERROR)
-
-    def restart(self, now_ns: int) -> None:
-        """Restart at a time [ns]."""
-        self.servo.reboot(now_ns)
-
-    def unplug(self, now_ns: int) -> None:
-        """Take its supply and its data away at a time [ns]."""
-        self.servo.reboot(now_ns)
-        self.servo.present = False
+    @property
+    def overloaded(self) -> bool:
+        """Whether it reports an overload."""
+        return bool(self.servo.get(r.HARDWARE_ERROR) & OVERLOAD_ERROR)
 
     def overload(self) -> None:
         """Report an overload; it gives no torque until it restarts."""
@@ -167,6 +177,8 @@ class StsJoint(EmulatedJoint):
         baud_rate: Rate of the bus.
         model: Its model number.
     """
+
+    servo: StsServo
 
     def __init__(self, servo: int, baud_rate: int, model: int) -> None:
         self.servo = StsServo(servo, baud_rate, model=model)
@@ -203,30 +215,14 @@ class StsJoint(EmulatedJoint):
     def tick(self, now_ns: int, silence_ns: int) -> None:
         """Do nothing: the bus advances its protections, and there is no watchdog."""
 
-    def trouble(self, now_ns: int) -> str:
-        """Return its fault at a time [ns]."""
-        return _trouble(self.servo, now_ns, self.servo.error & Fault.OVERLOAD)
-
-    def restart(self, now_ns: int) -> None:
-        """Restart at a time [ns]."""
-        self.servo.reboot(now_ns)
-
-    def unplug(self, now_ns: int) -> None:
-        """Take its supply and its data away at a time [ns]."""
-        self.servo.reboot(now_ns)
-        self.servo.present = False
+    @property
+    def overloaded(self) -> bool:
+        """Whether it reports an overload."""
+        return bool(self.servo.error & Fault.OVERLOAD)
 
     def overload(self) -> None:
         """Report an overload; it holds with Protective Torque until it restarts."""
         self.servo.fail(Fault.OVERLOAD, lasting=True)
-
-
-def _trouble(servo: EmulatedServo | StsServo, now_ns: int, overload: int) -> str:
-    if not servo.present:
-        return ABSENT
-    if not servo.awake(now_ns):
-        return RESTARTS
-    return OVERLOAD if overload else ""
 
 
 EmulatedArm: TypeAlias = tuple[Sequence[EmulatedJoint], ServosSide[Any]]

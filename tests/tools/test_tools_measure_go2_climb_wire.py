@@ -10,7 +10,7 @@ pytestmark = [pytest.mark.real_time, pytest.mark.slow]
 
 def test_a_walk_that_is_too_short_ends_before_the_platform(monkeypatch: pytest.MonkeyPatch) -> None:
     """After one second the run ends as planned, on the floor. A policy that is missing is an error."""
-    monkeypatch.setattr(measure_go2_climb_wire, "SECONDS", 1.0)
+    monkeypatch.setattr(measure_go2_climb_wire, "CLIMB_S", 1.0)
     row = measure_go2_climb_wire.measure("climb", "zenoh", 0.05, 3, blind=False)
     assert row["exit_code"] == 0 and row["end"].startswith("finished") and not row["error"]
     assert not row["climbed"] and 0.2 < row["furthest_m"] < 1.3
