@@ -2,14 +2,17 @@
 
     MUJOCO_GL=osmesa python tools/draw_policy.py humanoid --out walk.png
     MUJOCO_GL=osmesa python tools/draw_policy.py allegro --policy FILE.onnx --out turn.gif
+    MUJOCO_GL=osmesa python tools/draw_policy.py go2-climb --height 0.15 --out climb.gif
 
 The physics is drawn under uniform domain randomisation, as in training. Without a GPU: apt-get install
-libosmesa6. The hand's cube has a red arrow along its x axis; the green arrow beside it is the target's.
+libosmesa6. The hand's cube has a red arrow along its x axis; the green arrow beside it is the target's. The
+Go2 walks and canters straight ahead, at 1.0 and 1.2 m/s. It climbs at 0.6 m/s, and is told of its platform.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +23,13 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from deal_hw.bench.go2_tasks import STRAIGHT_M_S, climb_task
+from deal_hw.policies.canter_env import CanterEnv, CanterTask
+from deal_hw.policies.climb_env import ClimbEnv
+from deal_hw.policies.go2_env import Go2Env, WalkTask
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import recorded_description, training_task
+from deal_hw.sim.legged.terrain import Terrain, add_terrain
 from deal_hw.types import FloatArray
 from deal_hw.workflows.train import udr_distribution
 
@@ -29,6 +37,7 @@ ASSETS = Path(__file__).parents[1] / "policies" / "assets"
 SIZE: Final = (240, 240)
 """Width and height of a picture [px]."""
 ANIMATED_HZ: Final = 12.5
+WALK_M_S: Final = 1.0
 _BACKGROUND: Final = (0.93, 0.95, 0.96)
 
 
@@ -37,6 +46,8 @@ class View:
     """A robot's policy and where it is seen from.
 
     Attributes:
+        robot: The robot.
+        task: Name of one of its further tasks; "" for its usual one.
         file: Name of its shipped policy.
         distance: From the middle of the picture to the camera [m].
         azimuth: Of the camera [degrees].
@@ -45,6 +56,8 @@ class View:
         follows: Whether the camera follows the base along x and y.
     """
 
+    robot: str
+    task: str = ""
     file: str
     distance: float
     azimuth: float
@@ -53,8 +66,16 @@ class View:
     follows: bool
 
 
+_BESIDE_GO2: Final[dict[str, Any]] = {
+    "distance": 1.5,
+    "azimuth": 110.0,
+    "elevation": -12.0,
+    "look_at": (0.0, 0.0, 0.25),
+    "follows": True,
+}
 VIEWS: Final = {
     "allegro": View(
+        robot="allegro",
         file="allegro_turn",
         distance=0.36,
         azimuth=200.0,
@@ -63,9 +84,19 @@ VIEWS: Final = {
         follows=False,
     ),
     "ant": View(
-        file="ant_udr", distance=3.5, azimuth=110.0, elevation=-20.0, look_at=(0.0, 0.0, 0.3), follows=True
+        robot="ant",
+        file="ant_udr",
+        distance=3.5,
+        azimuth=110.0,
+        elevation=-20.0,
+        look_at=(0.0, 0.0, 0.3),
+        follows=True,
     ),
+    "go2": View(robot="go2", file="go2_walk", **_BESIDE_GO2),
+    "go2-canter": View(robot="go2", task="canter", file="go2_canter", **_BESIDE_GO2),
+    "go2-climb": View(robot="go2", task="climb", file="go2_climb", **_BESIDE_GO2),
     "humanoid": View(
+        robot="humanoid",
         file="humanoid_walk",
         distance=2.5,
         azimuth=110.0,
@@ -76,9 +107,28 @@ VIEWS: Final = {
 }
 
 
-def scene(path: Path) -> Any:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Episode:
+    """What there is to draw.
+
+    Attributes:
+        places: MuJoCo positions after each control period, (T, nq).
+        target: Rotation vector of the orientation that the cube is to have, (3,) [rad]; None without one.
+        terrain: The platform before a robot that climbs.
+        end: How it ended.
+    """
+
+    places: FloatArray
+    target: FloatArray | None = None
+    terrain: Terrain | None = None
+    end: str = "no fall"
+
+
+def scene(path: Path, terrain: Terrain | None) -> Any:
     """Return a robot's model with light, a plain sky and tiles on the floor, which show its speed."""
     spec: Any = mujoco.MjSpec.from_file(str(path))
+    if terrain is not None:
+        add_terrain(spec, terrain)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = SIZE
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.45] * 3, [0.5] * 3
     sky, square = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtTexture.mjTEXTURE_2D
@@ -122,28 +172,48 @@ def add_arrows(spec: Any, target: FloatArray) -> None:
         spec.worldbody.add_geom(size=[size, 0, 0], fromto=ends, rgba=[0, 0.6, 0.1, 1], **look)
 
 
-def episode(robot: str, policy: OnnxPolicy, seed: int, seconds: float) -> tuple[FloatArray, FloatArray, str]:
-    """Return a robot's MuJoCo positions after each control period, (T, nq), its target, and how it ended."""
-    description = recorded_description(robot)
-    env = training_task(robot).make(description, udr_distribution(robot), 1)
+def environment(view: View, height: float) -> Any:
+    """Return a robot in the environment of its task; a Go2 goes straight ahead, onto a platform [m]."""
+    description, drawn = recorded_description(view.robot), udr_distribution(view.robot, view.task)
+    if view.robot != "go2":
+        return training_task(view.robot, view.task).make(description, drawn, 1)
+    if view.task == "climb":
+        return ClimbEnv(description, drawn, 1, task=climb_task(height, blind=False))
+    kind, usual, speed = Go2Env, WalkTask(), WALK_M_S
+    if view.task == "canter":
+        kind, usual, speed = CanterEnv, CanterTask(), STRAIGHT_M_S
+    ahead = ((speed, speed), (0.0, 0.0), (0.0, 0.0))
+    return kind(
+        description, drawn, 1, task=dataclasses.replace(usual, command_range=ahead, standing=0.0, zeroed=0.0)
+    )
+
+
+def episode(view: View, policy: OnnxPolicy, seed: int, seconds: float, height: float) -> Episode:
+    """Run a policy in its environment."""
+    env = environment(view, height)
     env.observe_for(policy.spec)
     observation, _ = env.reset(seed=seed)
-    target = env.wanted[0].copy() if robot == "allegro" else np.zeros(3)
-    states, places = env.loop.batch.batch.bind("qpos"), []
-    for tick in range(min(env.ticks, round(seconds * description.control_rate_hz))):
+    shown: dict[str, Any] = {}
+    if view.robot == "allegro":
+        shown["target"] = env.wanted[0].copy()
+    if isinstance(env, ClimbEnv):
+        at = env.platforms
+        shown["terrain"] = Terrain(kind="box", rise=float(at.rise[0]), distance_m=float(at.distance[0]))
+    states, places = env.loop.batch.engine.bind("qpos"), []
+    rate_hz = env.description.control_rate_hz
+    for tick in range(min(env.ticks, round(seconds * rate_hz))):
         places.append(np.array(states[0]))
         observation, _, terminated, _, _ = env.step(policy.act_batch(observation))
         if terminated[0]:
-            return np.array(places), target, f"ended after {(tick + 1) / description.control_rate_hz:.2f} s"
-    return np.array(places), target, "no fall"
+            return Episode(places=np.array(places), end=f"ended after {(tick + 1) / rate_hz:.2f} s", **shown)
+    return Episode(places=np.array(places), **shown)
 
 
-def frames(robot: str, places: FloatArray, target: FloatArray) -> Iterator[Image.Image]:
+def frames(view: View, shown: Episode, places: FloatArray) -> Iterator[Image.Image]:
     """Yield a picture of each of these positions, (T, nq)."""
-    view, description = VIEWS[robot], recorded_description(robot)
-    spec = scene(Path(str(description.mjcf)))
-    if robot == "allegro":
-        add_arrows(spec, target)
+    spec = scene(Path(str(recorded_description(view.robot).mjcf)), shown.terrain)
+    if shown.target is not None:
+        add_arrows(spec, shown.target)
     model = spec.compile()
     data = mujoco.MjData(model)
     camera: Any = mujoco.MjvCamera()
@@ -169,24 +239,27 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, help="by default the shipped one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--height", type=float, default=0.15, help="of the platform before go2-climb [m]")
     parser.add_argument("--pictures", type=int, default=8, help="pictures of a strip")
     parser.add_argument("--out", type=Path, required=True, help="a .png strip or a .gif animation")
     args = parser.parse_args()
-    policy = OnnxPolicy(args.policy or ASSETS / f"{VIEWS[args.robot].file}.onnx")
-    places, target, end = episode(args.robot, policy, args.seed, args.seconds)
+    view = VIEWS[args.robot]
+    policy = OnnxPolicy(args.policy or ASSETS / f"{view.file}.onnx")
+    shown = episode(view, policy, args.seed, args.seconds, args.height)
+    places = shown.places
     if args.out.suffix == ".gif":
         chosen = places[:: round(50.0 / ANIMATED_HZ)]
-        pictures = [p.quantize(64) for p in frames(args.robot, chosen, target)]
+        pictures = [p.quantize(64) for p in frames(view, shown, chosen)]
         pictures[0].save(
             args.out, save_all=True, append_images=pictures[1:], duration=1000 / ANIMATED_HZ, loop=0
         )
     else:
         chosen = places[np.linspace(0, len(places) - 1, args.pictures).astype(int)]
         strip = Image.new("RGB", (SIZE[0] * args.pictures, SIZE[1]))
-        for k, picture in enumerate(frames(args.robot, chosen, target)):
+        for k, picture in enumerate(frames(view, shown, chosen)):
             strip.paste(picture, (k * SIZE[0], 0))
         strip.quantize(128).save(args.out, optimize=True)
-    print(f"{args.robot}: {end}, base moved {places[-1][:3] - places[0][:3]}; written: {args.out}")
+    print(f"{args.robot}: {shown.end}, base moved {places[-1][:3] - places[0][:3]}; written: {args.out}")
 
 
 if __name__ == "__main__":
