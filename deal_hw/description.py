@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
@@ -96,6 +97,7 @@ class SafetyLimits:
         ease_in_s: Time over which the policy gets full control [s].
         silence_s: The supervisor kills a control process without a heartbeat for this long [s].
         legs: For a robot with legs; None for others.
+        climbing: In place of ``legs`` while a policy that observes a platform drives; None: the same.
     """
 
     target: tuple[tuple[float, float], ...]
@@ -112,6 +114,7 @@ class SafetyLimits:
     ease_in_s: float
     silence_s: float = 0.3
     legs: LegLimits | None = None
+    climbing: LegLimits | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,6 +210,13 @@ class RobotDescription:
     def actuated_index(self) -> tuple[int, ...]:
         """Index of each actuated joint among the joints, (A,)."""
         return tuple(self.joint_names.index(name) for name in self.actuated)
+
+    def in_climb(self) -> RobotDescription:
+        """Return the robot with its limits for climbing in force."""
+        limits = self.limits
+        return dataclasses.replace(
+            self, limits=dataclasses.replace(limits, legs=limits.climbing or limits.legs)
+        )
 
     @property
     def steps_per_control(self) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
-from deal_hw.motions.behaviours import Behaviour, position_command
+from deal_hw.motions.behaviours import Behaviour, PolicyBehaviour, position_command
 from deal_hw.motions.planned_end import PlannedEnd, battery_reason
 from deal_hw.motions.velocity import SlowedVelocity
 from deal_hw.types import FloatArray, JointCommand, RobotState
@@ -77,6 +77,7 @@ class PostureBehaviour:
     """Stands up, runs another behaviour, comes to a stand, lies down.
 
     Attributes:
+        inner: As the argument.
         end: Takes requests for an earlier end, and tells how far the end is.
 
     Args:
@@ -106,7 +107,7 @@ class PostureBehaviour:
                 f"robot {description.name!r} has no rest pose to stand up from; use --stand False"
             )
         index = list(description.actuated_index)
-        self._inner, self._description, self._seconds, self._config = inner, description, seconds, config
+        self.inner, self._description, self._seconds, self._config = inner, description, seconds, config
         self._slowed, self.end = slowed, end or PlannedEnd()
         self._slow_s = 0.0 if slowed is None else SLOW_S + STEP_S
         self._rest = np.array(description.rest_position)[index]
@@ -119,7 +120,7 @@ class PostureBehaviour:
     @property
     def action(self) -> FloatArray | None:
         """The inner behaviour's action."""
-        return self._inner.action
+        return self.inner.action
 
     @property
     def duration_s(self) -> float:
@@ -134,7 +135,7 @@ class PostureBehaviour:
 
     def reset(self) -> None:
         """Restart from the beginning."""
-        self._inner.reset()
+        self.inner.reset()
         self._start: FloatArray | None = None
         self._last = self._default
         # Times at which the parts of the end began [s], and pose from which the present one began.
@@ -172,7 +173,7 @@ class PostureBehaviour:
         return self._standing(state, time_s)
 
     def _run_inner(self, state: RobotState, time_s: float) -> JointCommand:
-        command = self._inner.command(state, time_s - self._config.before_s)
+        command = self.inner.command(state, time_s - self._config.before_s)
         # A NaN target trips the safety module; the end must not start from it.
         if np.isfinite(command.position_target).all():
             self._last = command.position_target
@@ -214,3 +215,10 @@ def _fastest(state: RobotState) -> float:
     """Return the highest speed of a joint, or of the base about an axis [rad/s]."""
     base = 0.0 if state.body is None else float(np.max(np.abs(state.body.angular_velocity)))
     return max(float(np.max(np.abs(state.velocity))), base)
+
+
+def limited_for(behaviour: Behaviour, description: RobotDescription) -> RobotDescription:
+    """Return a robot with the limits of what a behaviour does: a climb, if its policy observes a platform."""
+    inner = behaviour.inner if isinstance(behaviour, PostureBehaviour) else behaviour
+    climbs = isinstance(inner, PolicyBehaviour) and inner.follows_obstacle
+    return description.in_climb() if climbs else description

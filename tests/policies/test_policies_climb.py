@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.filter import SafetyFilter
+from deal_hw.drivers.go2.emulator.truth import draw_truth
 from deal_hw.errors import ConfigurationError, PolicyError
 from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.motions.obstacle import parse_obstacle
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig, limited_for
+from deal_hw.motions.velocity import FixedVelocity
 from deal_hw.policies.climb_env import ClimbEnv, ClimbTask
-from deal_hw.policy import CLIMBED, ObservationBuilder
+from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.policy import CLIMBED, ObservationBuilder, PolicySpec
 from deal_hw.robots import recorded_description, training_task
-from deal_hw.sim.legged.terrain import Scuffs
+from deal_hw.sim.legged.terrain import Scuffs, Terrain
+from deal_hw.workflows.emulation import virtual_go2
 from deal_hw.workflows.running.plan import RunPlan, _ask_height, make_behaviour
 from deal_hw.workflows.running.view import RunView
+from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import nominal_distribution
 
 GO2 = recorded_description("go2")
@@ -154,9 +163,49 @@ def test_a_flat_policy_is_not_told_of_a_platform() -> None:
     assert isinstance(found, PolicyBehaviour) and found.follows_obstacle
 
 
-def test_the_filter_is_that_of_deploying() -> None:
-    """The climb has the walk's limits; it has none of its own yet."""
+def test_a_policy_that_observes_a_platform_has_the_limits_of_a_climb() -> None:
+    """Only the turn of the base differs from the walk's; so it is through standing up and lying down."""
     assert isinstance(make(1)._filter, SafetyFilter)
+    walk, climb = GO2.limits.legs, GO2.limits.climbing
+    assert walk is not None and climb is not None
+    assert (walk.tumble, climb.tumble) == (6.0, 8.0)
+    assert dataclasses.replace(climb, tumble=walk.tumble) == walk
+
+    class Still:
+        def __init__(self, spec: PolicySpec) -> None:
+            self.spec = spec
+
+        def reset(self) -> None: ...
+
+        def act(self, observation: object) -> np.ndarray:
+            return np.zeros(12)
+
+    flat = training_task("go2").make(GO2, nominal_distribution("go2"), 1).layout
+    for spec, legs in ((make(1).layout, climb), (flat, walk)):
+        inner = PolicyBehaviour(Still(spec), GO2)
+        whole = PostureBehaviour(inner, GO2, 2.0, PostureConfig())
+        assert limited_for(inner, GO2).limits.legs == limited_for(whole, GO2).limits.legs == legs
+    # A robot without limits of its own for climbing keeps those for legs.
+    usual = dataclasses.replace(GO2, limits=dataclasses.replace(GO2.limits, climbing=None))
+    assert limited_for(PolicyBehaviour(Still(make(1).layout), usual), usual) == usual
+
+
+@pytest.mark.slow
+def test_a_climb_is_not_ended_by_the_turn_of_a_stumble() -> None:
+    """Robot 8 turns at 6.5 rad/s before the platform, and climbs all the same."""
+    policy = OnnxPolicy(required_policy("go2", "climb"))
+    ahead, platform = FixedVelocity((0.6, 0.0, 0.0)), Terrain(kind="box", rise=0.2)
+    told: dict[str, Any] = {
+        "record": False,
+        "terrain": platform,
+        "obstacle": (1.0, 0.2),
+        "hold_heading": True,
+    }
+    done = virtual_go2.walk(draw_truth("realistic", 8), policy, ahead, 6.0, **told)
+    assert done.report.outcome is Outcome.FINISHED and done.track.place[:, 0].max() > 1.5
+    with mock.patch.object(virtual_go2, "limited_for", lambda behaviour, description: description):
+        done = virtual_go2.walk(draw_truth("realistic", 8), policy, ahead, 6.0, **told)
+    assert done.report.outcome is Outcome.TRIPPED and "the base turns" in done.report.reason
 
 
 def test_told_feet_are_to_rise_over_the_edge_and_blind_ones_are_free() -> None:

@@ -24,7 +24,7 @@ from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.motions.planned_end import PlannedEnd
-from deal_hw.motions.posture import PostureBehaviour, PostureConfig
+from deal_hw.motions.posture import PostureBehaviour, PostureConfig, limited_for
 from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, Track, Wanted, velocity_data, wanted_in
 from deal_hw.motions.velocity import HeldHeading, NotedVelocity, SlowedVelocity, VelocitySource
 from deal_hw.policy import Policy
@@ -129,7 +129,8 @@ def walk(
             recording.enter_context(recorder)
         robot = Go2Robot(VirtualTopics(watched, clock), clock)
         config = LoopConfig(duration_s=whole.longest_s)
-        loop = ControlLoop(robot, whole, Safety(DRIVER), clock, keep, config, end=whole.end)
+        safety = Safety(limited_for(whole, DRIVER))
+        loop = ControlLoop(robot, whole, safety, clock, keep, config, end=whole.end)
         report = loop.run()
         recording.close()
         if record:

@@ -109,6 +109,7 @@ def _run(
     from deal_hw.control.safety.passive import PassiveConfig
     from deal_hw.control.safety.safety import Safety
     from deal_hw.motions.planned_end import PlannedEnd
+    from deal_hw.motions.posture import limited_for
     from deal_hw.motions.scores.velocity_error import VELOCITY_EVENT, velocity_data
     from deal_hw.motions.velocity import END_KEY, KeyboardVelocity, NotedVelocity
     from deal_hw.robots.connect import adopt_robot, make_robot
@@ -155,7 +156,7 @@ def _run(
     loop = ControlLoop(
         robot,
         behaviour,
-        Safety(robot.description),
+        Safety(limited_for(behaviour, robot.description)),
         clock,
         sink,
         LoopConfig(

@@ -47,6 +47,7 @@ LEG_LIMITS: Final = LegLimits(
     arm_voltage=28.0,
     command_age_s=0.05,
 )
+CLIMB_LIMITS: Final = dataclasses.replace(LEG_LIMITS, tumble=8.0)
 LEG_SOURCES: Final[Mapping[str, str]] = {
     "legs.effort": (
         "unitree_rl_lab @ e72a072, Go2: effort limit 23.5 N·m for every joint; the calves could give 45.43"
@@ -70,7 +71,9 @@ LEG_SOURCES: Final[Mapping[str, str]] = {
 }
 
 
-def driver_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyLimits:
+def driver_limits(
+    limits: SafetyLimits, legs: LegLimits = LEG_LIMITS, climbing: LegLimits | None = None
+) -> SafetyLimits:
     """Return limits with those for legs, and with a margin for a robot that lies on its stops.
 
     The calves of a lying robot were seen at -2.81 rad, 0.09 beyond the mechanical range of the models. The
@@ -85,6 +88,7 @@ def driver_limits(limits: SafetyLimits, legs: LegLimits = LEG_LIMITS) -> SafetyL
         target_step=(TARGET_STEP_RAD,) * 12,
         silence_s=0.2,
         legs=legs,
+        climbing=climbing,
     )
 
 
@@ -95,7 +99,7 @@ DRIVER: Final[RobotDescription] = dataclasses.replace(
     passive_damping=(PASSIVE_DAMPING_NMS_RAD,) * 12,
     rest_position=floor.per_joint(RESTING_RAD),
     feet=tuple(f"{leg}_foot" for leg in floor.LEGS),
-    limits=driver_limits(floor.DESCRIPTION.limits),
+    limits=driver_limits(floor.DESCRIPTION.limits, climbing=CLIMB_LIMITS),
     sources={
         **floor.DESCRIPTION.sources,
         "state_rate_hz": "rt/lowstate comes at 500 Hz, its tick counts 2 ms",
