@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from scipy.special import ndtr
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.go2_env import Go2Env, WalkTask
-from deal_hw.policies.vector_env import check_task
+from deal_hw.policies.reference_motion import ReferenceMotion
 from deal_hw.types import FloatArray
 
+REFERENCE: Final = Path(__file__).parent / "assets" / "go2_canter_motion.npz"
+"""The shipped canter of the nominal robot under drawn commands: tools/make_reference_motion.py."""
+_OF_GAIT: Final = (
+    "gait_weight",
+    "schedule_weight",
+    "slip_weight",
+    "tilt_weight",
+    "height_weight",
+    "bounce_weight",
+    "roll_weight",
+    "hip_weight",
+)
+"""Weights of rewards that say how to move, where a reference motion does not."""
 NEAR_M: Final = 0.01
 """Height of a foot's sole at which it no longer counts as a contact; between this and the floor it counts in
 part. The batched engine has no contact sensor, and the floor gives way by less than a millimetre."""
@@ -98,7 +113,8 @@ class CanterTask(WalkTask):
     def __post_init__(self) -> None:
         # A class with slots has no super() without arguments.
         WalkTask.__post_init__(self)
-        check_task(self, "schedule_weight")
+        if not self.schedule_weight >= 0:
+            raise ConfigurationError(f"schedule_weight must not be negative, got {self.schedule_weight!r}")
 
 
 class CanterEnv(Go2Env):
@@ -126,6 +142,14 @@ class CanterEnv(Go2Env):
 
     task: CanterTask
     task_type = CanterTask
+
+    def imitate(self) -> ReferenceMotion:
+        """Leave the gait to the shipped canter: of the rewards stay commands, safety and falls."""
+        found = ReferenceMotion.read(REFERENCE)
+        found.check(self.motion_names(), self.description.control_rate_hz)
+        none: Any = dict.fromkeys(_OF_GAIT, 0.0)
+        self.task = dataclasses.replace(self.task, **none)
+        return found
 
     def contacts(self) -> FloatArray:
         """Return how much each foot is on the floor, (N, F) in 0 to 1."""

@@ -25,7 +25,7 @@ from deal_hw.policies.locomotion import (
 )
 from deal_hw.policies.servo_loop import BoolArray
 from deal_hw.policies.vector_env import check_task
-from deal_hw.policy import CLOCK_AXES, Observation, ObservationTerm, PolicySpec
+from deal_hw.policy import AXES, CLOCK_AXES, Observation, ObservationTerm, PolicySpec
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.parameters.fields import element_id
@@ -328,6 +328,19 @@ class Go2Env(LocomotionEnv):
         seen = base(self.loop.position, self.loop.velocity)
         feet = 10.0 * (self._feet_now()[..., 2] - self._radius)
         return np.hstack([seen[:, LINEAR], 4.0 * self.base_height(self.loop.position)[:, None], feet])
+
+    def motion_names(self) -> tuple[str, ...]:
+        """Return the names of the features of :meth:`motion`."""
+        vectors = [f"{name}_{axis}" for name in ("gravity", "velocity", "turn") for axis in AXES]
+        joints = self.description.joint_names
+        return (*vectors, "height", *joints, *(f"{name}_velocity" for name in joints))
+
+    def motion(self) -> FloatArray:
+        """Return what the bodies do, (N, F): gravity and velocities in the base's frame, height, joints."""
+        position, velocity = self.loop.position, self.loop.velocity
+        seen = base(position, velocity)
+        vectors = [seen[:, GRAVITY], seen[:, LINEAR], seen[:, ANGULAR], self.base_height(position)[:, None]]
+        return np.hstack([*vectors, position[:, 6:], velocity[:, 6:]])
 
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray

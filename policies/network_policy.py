@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,14 @@ class NetworkPolicy:
         with torch.no_grad():
             action = self.network(torch.as_tensor(observations, dtype=torch.float32))
         return np.asarray(action.numpy(), dtype=np.float64)
+
+
+def layers(inputs: int, hidden: Sequence[int], outputs: int) -> torch.nn.Sequential:
+    """Return a network of linear layers with ELU between them."""
+    found: list[torch.nn.Module] = []
+    for before, after in itertools.pairwise([inputs, *hidden, outputs]):
+        found += [torch.nn.Linear(before, after), torch.nn.ELU()]
+    return torch.nn.Sequential(*found[:-1])
 
 
 class Feedback(torch.nn.Module):

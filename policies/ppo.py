@@ -335,10 +335,13 @@ class PpoLearner:
         self._before = found.notes.get("mean_return")
 
     def _load_networks(self, found: Checkpoint, whole: bool) -> None:
+        self._load_parts(found, whole, self._parts())
+
+    def _load_parts(self, found: Checkpoint, whole: bool, parts: Mapping[str, torch.nn.Module]) -> None:
         observed = int(found.notes["observed"])
         more = len(self._env.layout.observation) - observed
         added = None if whole else (observed, more)
-        for part, model in self._parts().items():
+        for part, model in parts.items():
             model.load_state_dict(found.part(part, model.state_dict(), added))
 
     def _parts(self) -> dict[str, torch.nn.Module]:

@@ -10,7 +10,6 @@ gets pi(o, phi(o, history)) as one network.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ from tensordict import TensorDict
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.checkpoint import Checkpoint, read_checkpoint
-from deal_hw.policies.network_policy import AdaptedNetwork, Feedback
+from deal_hw.policies.network_policy import AdaptedNetwork, Feedback, layers
 from deal_hw.policies.ppo import PpoConfig, PpoLearner, PpoTrainer
 from deal_hw.policies.vector_env import ServoVectorEnv, TaskKnowledge
 from deal_hw.policy import MAX_DELAY, Observation, PolicySpec
@@ -210,14 +209,6 @@ class _RmaLearner(PpoLearner):
 
     def _symmetry(self) -> None:
         """Return nothing: the reflection of extrinsics is not known."""
-
-
-def layers(inputs: int, hidden: Sequence[int], outputs: int) -> torch.nn.Sequential:
-    """Return a network of linear layers with ELU between them."""
-    found: list[torch.nn.Module] = []
-    for before, after in itertools.pairwise([inputs, *hidden, outputs]):
-        found += [torch.nn.Linear(before, after), torch.nn.ELU()]
-    return torch.nn.Sequential(*found[:-1])
 
 
 def _by_name(weight: torch.Tensor, first: int, names: Sequence[str], wanted: Sequence[str]) -> torch.Tensor:

@@ -64,7 +64,7 @@ _STRIDE_PPO: Final = {
 }
 
 
-_AS: Final = {"rma": "ppo"}
+_AS: Final = {"amp": "ppo", "rma": "ppo"}
 """Trainers with the usual settings of another one, on which they stand."""
 
 

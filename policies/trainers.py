@@ -8,6 +8,7 @@ from typing import Any
 from deal_hw.errors import UnknownNameError
 
 TRAINERS: dict[str, str] = {
+    "amp": "deal_hw.policies.amp:AmpTrainer",
     "ppo": "deal_hw.policies.ppo:PpoTrainer",
     "rma": "deal_hw.policies.rma:RmaTrainer",
     "sac": "deal_hw.policies.sac:SacTrainer",

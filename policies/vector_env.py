@@ -18,6 +18,7 @@ from deal_hw.description import RobotDescription, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.motions.behaviours import centre
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
+from deal_hw.policies.reference_motion import ReferenceMotion
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import BASE_QUANTITIES, Observation, ObservationBuilder, PolicySpec
 from deal_hw.sim.engine.gpu import EngineName
@@ -26,6 +27,12 @@ from deal_hw.types import FloatArray
 
 FELT: Final = ("position", "velocity", "sin_position", "cos_position", "action", *BASE_QUANTITIES)
 """Quantities that tell of the robot itself: its joints, its actions and its base."""
+
+
+NO_REFERENCE: Final = (
+    "trainer amp imitates a reference motion, and this task has none: there is one of the Go2's canter; "
+    "train it with ppo or sac"
+)
 
 
 def check_task(task: Any, *positive: str) -> None:
@@ -114,6 +121,22 @@ class TaskKnowledge:
     def extrinsics(self) -> Extrinsics | None:
         """Return what the simulator knows of its members now; None where nothing is known by name."""
         return None
+
+    def motion(self) -> FloatArray:
+        """Return what the bodies of the members do now, (N, F): the features of :meth:`imitate`.
+
+        Raises:
+            ConfigurationError: The task has no reference motion.
+        """
+        raise ConfigurationError(NO_REFERENCE)
+
+    def imitate(self) -> ReferenceMotion:
+        """Leave how to move to a reference motion: drop the rewards of a gait, and return the motion.
+
+        Raises:
+            ConfigurationError: The task has no reference motion.
+        """
+        raise ConfigurationError(NO_REFERENCE)
 
     def observe_history(self, periods: int) -> None:
         """Extend the observation by what was felt and done in so many former control periods.

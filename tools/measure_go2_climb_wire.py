@@ -1,7 +1,7 @@
 """Let an emulated Go2 climb over its wire, in real time: the whole of `deal-hw deploy`, DDS and Zenoh.
 
     python tools/measure_go2_climb_wire.py --policy climb --height 0.1 --seeds 1000-1004 --out climb_wire.json
-    python tools/measure_go2_climb_wire.py --wires virtual --height 0.15 0.2 --seeds 1000-1009 --out climb.json
+    python tools/measure_go2_climb_wire.py --wires virtual --height 0.15 0.2 --seeds 1000-1009 --out FILE
 
 The emulator is a process of its own, with hidden gains, friction, payload and latency, and with a platform
 1 m ahead. `deal-hw deploy` stands the robot up, walks it ahead at 0.6 m/s for 6 s, and lays it down. A try

@@ -18,6 +18,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.cartpole_env import BalanceTask, CartPoleEnv, balance_spec
 from deal_hw.policies.evaluate import evaluate_batch
 from deal_hw.policies.onnx_export import export_network
+from deal_hw.policies.reference_motion import ReferenceMotion
 from deal_hw.policies.servo_loop import EXACT_SENSOR
 from deal_hw.policies.single_env import SingleEnv
 from deal_hw.policies.trainers import TRAINERS, make_trainer
@@ -25,6 +26,7 @@ from deal_hw.policy import Policy
 from deal_hw.robots import trained_robots, training_task
 from deal_hw.testing.trainer_suite import TrainerCase, TrainerSuite
 from deal_hw.training import TrainingFiles
+from deal_hw.types import FloatArray
 
 SPACE = k9_space()
 TOY = ParameterDistribution.point(SPACE, SPACE.nominal, 0.0)
@@ -116,6 +118,48 @@ def rma_case() -> TrainerCase:
     )
 
 
+class StyledCartPole(CartPoleEnv):
+    """The toy without a reward of its own: all it has to learn from is a pole that stands upright."""
+
+    def motion(self) -> FloatArray:
+        """Return cart and pole, (N, 4)."""
+        return np.hstack([self.loop.position, self.loop.velocity])
+
+    def imitate(self) -> ReferenceMotion:
+        """Return a pole that hardly moves, as an expert holds it."""
+        still = np.random.default_rng(0).normal(size=(400, 4)) * [0.01, 0.005, 0.02, 0.05]
+        return ReferenceMotion(names=("x", "angle", "v", "turn"), rate_hz=50.0, starts=(0,), values=still)
+
+    def reward(self, *_: FloatArray) -> FloatArray:
+        """Return nothing."""
+        return np.zeros(self.num_envs)
+
+
+def amp_case() -> TrainerCase:
+    """Return AMP and the toy without a reward."""
+    from deal_hw.policies.amp import AmpConfig, AmpTrainer
+
+    case = toy_case(
+        AmpTrainer(),
+        64,
+        AmpConfig(steps=120_000, style_weight=1.0, **ON_POLICY),
+        AmpConfig(steps=1_024, **ON_POLICY),
+    )
+    make = lambda: StyledCartPole(DESCRIPTION, TOY, 64, task=TASK, sensor=EXACT_SENSOR)  # noqa: E731
+    return dataclasses.replace(case, make_env=make)
+
+
+@pytest.mark.slow
+class TestAmp(TrainerSuite):
+    """AMP keeps the contract of trainers."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def case(cls) -> TrainerCase:
+        """Return AMP and the toy."""
+        return amp_case()
+
+
 @pytest.mark.slow
 class TestSac(TrainerSuite):
     """SAC keeps the contract of trainers."""
@@ -149,7 +193,7 @@ class TestRma(TrainerSuite):
         return rma_case()
 
 
-@pytest.mark.parametrize("make", [sac_case, ppo_case, rma_case])
+@pytest.mark.parametrize("make", [amp_case, sac_case, ppo_case, rma_case])
 def test_a_request_to_stop_is_heard_within_an_update(make: Callable[[], TrainerCase], tmp_path: Path) -> None:
     """On a slow computer an update takes minutes: no further optimiser step, whole files.
 
@@ -324,7 +368,7 @@ def test_every_trainer_loads_under_its_name(name: str) -> None:
 
 def test_unknown_trainer_lists_the_trainers() -> None:
     """A wrong name is answered with the right ones."""
-    with pytest.raises(UnknownNameError, match=r"td3.*ppo, rma, sac"):
+    with pytest.raises(UnknownNameError, match=r"td3.*amp, ppo, rma, sac"):
         make_trainer("td3")
 
 
