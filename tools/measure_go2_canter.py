@@ -15,7 +15,8 @@ more, and comes to a stand. A row is one robot and speed:
 - duty, phase and steps of each foot by the robot's own foot sensors, and their errors against the schedule of
   the policy's training (`deal_hw.policies.canter_env.ContactSchedule`).
 
-The gait diagram has the schedule above and the policy below: a bar is a foot on the floor.
+The gait diagram has the schedule above and the policy below: a bar is a foot on the floor. With `--reference
+FILE` it has another policy on the same robot above, such as the one that the policy imitates.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ def diagram(trajectory: Trajectory, policy: OnnxPolicy, schedule: ContactSchedul
 
 
 def draw(path: Path, shown: dict[str, Any], title: str) -> None:
-    """Draw plan and policy, one above the other."""
+    """Draw the plan, or a reference in its place, and the policy, one above the other."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -157,7 +158,8 @@ def draw(path: Path, shown: dict[str, Any], title: str) -> None:
 
     time_s = np.array(shown["time_s"])
     figure, rows = plt.subplots(2, 1, figsize=(8, 3.6), sharex=True, layout="constrained")
-    for axes, name in zip(rows, ("plan", "policy"), strict=True):
+    above = "reference" if "reference" in shown else "plan"
+    for axes, name in zip(rows, (above, "policy"), strict=True):
         down = np.array(shown[name], dtype=bool)
         for place, leg in enumerate(("RL", "RR", "FL", "FR")):
             state = np.concatenate([[False], down[:, LEGS.index(leg)], [False]]).astype(int)
@@ -207,6 +209,7 @@ def main() -> None:
     add_seeds(options, 0)
     options.add_argument("--speeds", type=float, nargs="+", default=[1.0, 1.5])
     options.add_argument("--hold-heading", action="store_true", help="as `deal-hw deploy --hold-heading`")
+    options.add_argument("--reference", type=Path, help="draw this policy in place of the schedule")
     options.add_argument("--draw", type=Path, help="draw the gait of the first row to this PNG file")
     args = options.parse_args()
     if args.table is not None:
@@ -220,6 +223,16 @@ def main() -> None:
                 if not kept.done(args.profile, seed, speed):
                     row, shown = measure(policy, schedule, args.profile, seed, speed, args.hold_heading)
                     first = not any("diagram" in other for other in kept.rows)
+                    if first and args.reference is not None:
+                        of = (
+                            OnnxPolicy(args.reference),
+                            schedule,
+                            args.profile,
+                            seed,
+                            speed,
+                            args.hold_heading,
+                        )
+                        shown["reference"] = measure(*of)[1]["policy"]
                     kept.add({**row, "diagram": shown} if first else row, json.dumps(row))
         rows = kept.rows
     print(table(rows))

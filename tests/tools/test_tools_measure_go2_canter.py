@@ -24,6 +24,19 @@ def test_the_diagram_has_plan_and_policy(tmp_path: Path) -> None:
     assert {(102, 102, 102), (31, 119, 180)} <= colours
 
 
+def test_a_reference_takes_the_place_of_the_plan(tmp_path: Path) -> None:
+    """A reference that never stands leaves the upper half without bars, whatever the plan is."""
+    time_s = np.arange(0.0, 1.0, 0.01)
+    down = ContactSchedule().stance(2.5 * time_s).astype(int)
+    path, values = tmp_path / "gait.png", {"time_s": time_s.tolist(), "plan": down.tolist()}
+    shown = {**values, "policy": down.tolist(), "reference": np.zeros_like(down).tolist()}
+    measure_go2_canter.draw(path, shown, "a robot")
+    with Image.open(path) as picture:
+        pixels = {colour: count for count, colour in picture.convert("RGB").getcolors(1 << 20) or []}
+    # Smoothed letters have some grey, too.
+    assert pixels[(31, 119, 180)] > 10_000 > 100 > pixels.get((102, 102, 102), 0)
+
+
 def test_the_table_has_sizes_not_signs() -> None:
     """A deviation to the left and one to the right do not cancel; runs that ended early are counted."""
     rows = [
