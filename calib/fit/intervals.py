@@ -32,6 +32,7 @@ from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import expected_directions, null_directions, null_space
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
+from deal_hw.calib.fit.unexplained import Unexplained, as_one, autocorrelated
 from deal_hw.calibration import EXPLAINED_CHI2, Z90, Identifiability, listed
 from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
@@ -161,7 +162,7 @@ class Uncertainty:
 
     def with_alarms(self, *first: Finding, last: Sequence[Finding] = ()) -> Uncertainty:
         """Return it with more alarms, before and after its own."""
-        return dataclasses.replace(self, alarms=(*first, *self.alarms, *last))
+        return dataclasses.replace(self, alarms=as_one((*first, *self.alarms, *last)))
 
     def with_covariance(self, covariance: FloatArray) -> Uncertainty:
         """Return it with another covariance, (K, K), and the intervals that follow from it."""
@@ -378,7 +379,7 @@ def _alarms(
     timing_std_s: float,
     pressed: npt.NDArray[np.bool_],
 ) -> tuple[Finding, ...]:
-    alarms = []
+    alarms: list[Finding] = []
     if timing_std_s >= LEAST_JITTER_S:
         alarms.append(
             Finding.alarm(
@@ -388,16 +389,9 @@ def _alarms(
             )
         )
     if chi2 > MISMATCH_CHI2:
-        alarms.append(mismatch(chi2))
+        alarms.append(Unexplained.larger(chi2))
     if chi2 > NEGLIGIBLE_CHI2 and least_tau > CORRELATION_SAMPLES:
-        alarms.append(
-            Finding.alarm(
-                f"Residuals are autocorrelated over {tau:.1f} samples; the sensor's noise is not.",
-                "The robot has something that the model lacks: a friction law, backlash or a varying delay.",
-                "Free a parameter for it (--parameters) or repair the hardware; trust predictions more than "
-                "values.",
-            )
-        )
+        alarms.append(Unexplained.of([autocorrelated(tau)]))
     # A mass or a play of 0 is an answer: there is no wider range.
     least = np.array([p.low <= find_kind(p.kind).least for p in space.free])
     ended = ended_at_bound(space, theta) & ~(least & (theta < space.center))
@@ -421,18 +415,7 @@ def _alarms(
                     "model.",
                 )
             )
-    return tuple(alarms)
-
-
-def mismatch(chi2: float, window: str = "") -> Finding:
-    """Return the alarm of residuals above the sensors' noise; ``window`` names the windows."""
-    return Finding.alarm(
-        f"Residuals are {np.sqrt(chi2):.1f} times the sensor's noise{window}.",
-        "The model does not explain the recording: it lacks something that the robot has (a friction law, "
-        "backlash, a varying delay), or a range is too narrow. The intervals count all of it as noise.",
-        "Repair the causes that other alarms name, or widen ranges, and calibrate again. Judge this model by "
-        "its held-out error.",
-    )
+    return as_one(alarms)
 
 
 def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.bool_]:

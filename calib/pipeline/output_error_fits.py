@@ -30,7 +30,6 @@ from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import (
     MISMATCH_CHI2,
     Uncertainty,
-    mismatch,
     names_at_bound,
     uncertainty_at,
     with_rows,
@@ -46,6 +45,7 @@ from deal_hw.calib.fit.output_error import (
     standing_rmse,
 )
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, at_parameters
+from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
 from deal_hw.calib.search.no_data import nominal
@@ -255,7 +255,7 @@ class OutputErrorFits(Fits):
             seconds = settings.mismatch_s or settings.long_s
             kind = "fitted" if settings.mismatch_s else "smoothed"
             window = f" over {seconds:g} s from {kind} start states"
-            known = known.with_alarms(last=[mismatch(chi2, window)])
+            known = known.with_alarms(last=[Unexplained.larger(chi2, window)])
         words = dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))
         known = dataclasses.replace(known, null_directions=tuple(words))
         return FitOutcome(

@@ -27,7 +27,6 @@ from deal_hw.calib.fit.intervals import (
     EVIDENCE,
     MISMATCH_CHI2,
     WHITE_SAMPLES,
-    mismatch,
     uncertainty_at,
     with_rows,
 )
@@ -37,6 +36,7 @@ from deal_hw.calib.fit.refinement import (
     local_fit,
     refine,
 )
+from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import (
     AFTER_FIT,
     EXPLANATIONS,
@@ -416,7 +416,9 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
         f"(multiples of their noise): {words}",
     )
     found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit, wrong=True)
-    return found.with_alarms(last=[mismatch(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale)
+    return found.with_alarms(
+        last=[Unexplained.larger(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale
+    )
 
 
 def with_explanation(run: CalibrationRun) -> FitOutcome | None:

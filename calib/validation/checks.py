@@ -29,10 +29,11 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
 from deal_hw.calib.validation.explain import Allows, Tried
-from deal_hw.calib.validation.residual_place import unexplained_alarm
+from deal_hw.calib.validation.residual_place import residual_place
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calibration import Z90, listed
@@ -211,7 +212,7 @@ def with_causes(
     """
     alarms: list[Finding] = list(found[:MOST_CAUSES])
     if not found and refined.chi2 > MISMATCH_CHI2:
-        alarms = [unexplained_alarm(problem, refined)]
+        alarms = [Unexplained.larger(refined.chi2, place=residual_place(problem, refined))]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calibration import percent
-from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
 BINS = 16
@@ -45,21 +44,6 @@ class Stretch:
     high: float
     share: float
     samples: float
-
-
-def unexplained_alarm(problem: Problem, refined: Refined) -> Finding:
-    """Return the alarm of a residual that none of the known causes explains, with the place where it lies."""
-    seen = (
-        f"None of the known causes explains the residual, which is {np.sqrt(refined.chi2):.1f} times the "
-        f"sensor's noise. {residual_place(problem, refined)}"
-    )
-    return Finding.alarm(
-        seen,
-        "The model lacks something, or a sensor is wrong there: blind or bent in a part of its range, or "
-        "with another scale.",
-        "Plot the measured positions there, and check the sensor's scale against a known angle or length. "
-        "Leave out what a sensor got wrong, or repair it; else add to the model what is missing.",
-    )
 
 
 def residual_place(problem: Problem, refined: Refined) -> str:

@@ -85,7 +85,7 @@ def test_each_alarm_is_on_its_page(pages: dict[str, str]) -> None:
     }
     assert all(part.strip("… ") for row in found for part in row)
     page = pages["reference/alarms.md"]
-    assert "| Residuals are … times the sensor's noise…. | The model does not explain the recording: " in page
+    assert "| Residuals are …. | The model does not explain the recording: " in page
     assert "\n| backlash | play in the gear | " in page
 
 
