@@ -8,10 +8,13 @@ r"""Make the shipped policies of Allegro hand, ant, humanoid and Go2, trained un
     python tools/train_demo_policy.py go2 --task climb --start policies/assets/go2_walk.safetensors
     python tools/train_demo_policy.py go2 --task climb --trainer rma \
         --start policies/assets/go2_climb.safetensors
+    python tools/train_demo_policy.py go2 --task canter --trainer amp \
+        --start policies/assets/go2_walk.safetensors
 
 writes policies/assets/allegro_turn.onnx, ant_udr.onnx, humanoid_walk.onnx, go2_walk.onnx, go2_canter.onnx,
-go2_climb.onnx or go2_climb_rma.onnx and, beside it, the record of its training and of its results on other
-robots. Task, trainer and settings are those of `deal-hw train ROBOT --udr`, with `--task` and `--trainer`.
+go2_climb.onnx, go2_climb_rma.onnx or go2_canter_amp.onnx and, beside it, the record of its training and of
+its results on other robots. Task, trainer and settings are those of `deal-hw train ROBOT --udr`, with
+`--task` and `--trainer`.
 
 `--hours` ends the training after so many processor hours, those of the stopped parts included. The same
 command with `--resume` goes on from the checkpoint, also after a crash. The curve of the return against steps
@@ -50,6 +53,8 @@ from deal_hw.workflows.train import train_policy, udr_distribution
 ASSETS = Path(__file__).parents[1] / "policies" / "assets"
 FILES = {"allegro": "allegro_turn", "ant": "ant_udr", "go2": "go2_walk", "humanoid": "humanoid_walk"}
 OTHER_TASKS = {("go2", "canter"): "go2_canter", ("go2", "climb"): "go2_climb"}
+NAMED = ("amp", "rma")
+"""Trainers whose name is in that of the policy."""
 POINTS = 100
 """Number of points of a curve over all steps of a training."""
 JUDGED = 256
@@ -235,7 +240,7 @@ def main() -> None:
     parser.add_argument("--judge", action="store_true", help="do not train: evaluate the existing file")
     args = parser.parse_args()
     name = OTHER_TASKS[args.robot, args.task] if args.task else FILES[args.robot]
-    name += "_rma" if args.trainer == "rma" else ""
+    name += f"_{args.trainer}" if args.trainer in NAMED else ""
     path = args.out or ASSETS / f"{name}.onnx"
     if args.judge:
         record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
