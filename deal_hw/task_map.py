@@ -35,7 +35,7 @@ class TaskMap(abc.ABC):
         specs: Sequence[S],
         lost: Callable[[S, TaskLostError], R] | None = None,
     ) -> Generator[tuple[int, R], None, None]:
-        """Yield the index and the result of each task as it ends; closed early, it cancels the others.
+        """Yield the index and the result of each task as it ends; closed early, it begins no others.
 
         Args:
             function: Pure: its result depends on the specification alone. What all tasks have in common, such

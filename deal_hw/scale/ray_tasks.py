@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,23 +148,33 @@ class RayTasks(TaskMap):
         specs: Sequence[S],
         lost: Callable[[S, TaskLostError], R] | None = None,
     ) -> Generator[tuple[int, R], None, None]:
-        """See :meth:`TaskMap.completed`. Where the iteration is left early, the other tasks are cancelled."""
+        """See :meth:`TaskMap.completed`.
+
+        Ray gets as many tasks as it has room for, and one more. So where the iteration is left early, the
+        others are not begun, and nothing has to be cancelled: Ray 2.60 ends this process where a task that it
+        cancels answers at that moment ("Tried to complete task that was not pending", as in its pull request
+        54798). Tasks that have begun go on to their end, or to that of the workers.
+        """
         import ray
 
         task = ray.remote(max_retries=RETRIES, num_cpus=self._threads)(_do)
         with explained(self._where):
             common = ray.put(_Common(function, list(sys.argv), Path.cwd()))
-            pending = {task.remote(common, spec): index for index, spec in enumerate(specs)}
-        try:
-            while pending:
-                (done,), _ = ray.wait(list(pending), num_returns=1)
-                index = pending[done]
-                found = self._result(done, specs[index], lost)
-                del pending[done]
-                yield index, found
-        finally:
-            for left in pending:
-                ray.cancel(left, force=True)
+        waiting, pending = deque(enumerate(specs)), dict[Any, int]()
+        while waiting or pending:
+            with explained(self._where):
+                while waiting and len(pending) <= self._room():
+                    index, spec = waiting.popleft()
+                    pending[task.remote(common, spec)] = index
+            (done,), _ = ray.wait(list(pending), num_returns=1)
+            index = pending.pop(done)
+            yield index, self._result(done, specs[index], lost)
+
+    def _room(self) -> int:
+        """Return how many tasks run at once on the machines that are there now."""
+        import ray
+
+        return int(ray.cluster_resources().get("CPU", 0.0)) // self._threads
 
     def _result(self, done: Any, spec: S, lost: Callable[[S, TaskLostError], R] | None) -> R:
         """Return a task's result, raising what it has raised."""

@@ -37,6 +37,9 @@ folder, found = Path.cwd(), {}
 def power(shared, spec):
     return [spec, spec ** len(shared)]
 
+def power_of_two(spec):
+    return 2 ** spec
+
 def seen(spec):
     return [sys.argv[1:], os.getcwd(), os.environ["OMP_NUM_THREADS"], os.environ["OPENBLAS_NUM_THREADS"]]
 
@@ -53,6 +56,10 @@ def dies_once(spec):
 def dies(spec):
     if spec == 1:
         os.kill(os.getpid(), signal.SIGKILL)
+    return spec
+
+def marks(spec):
+    (folder / f"begun {spec}").touch()
     return spec
 
 def raised(function, spec):
@@ -77,6 +84,11 @@ with task_map("local:2") as tasks:
     found["died once"] = tasks.map(dies_once, [1, 2])
     found["lost"] = dict(tasks.completed(dies, [0, 1, 2], lambda spec, why: -spec))
     found["lost alone"] = raised(dies, 1)
+    early = tasks.completed(marks, range(40))
+    found["first"] = next(early)
+    early.close()
+    found["after"] = tasks.map(power_of_two, range(4))
+    found["begun"] = len(list(folder.glob("begun *")))
 print(json.dumps(found))
 """
 
@@ -147,3 +159,10 @@ def test_a_task_that_kills_each_worker_is_lost_and_the_others_are_done(
     assert found[1]["lost"] == {"0": 0, "1": -1, "2": 2}
     kind, said = found[1]["lost alone"]
     assert kind == "TaskLostError" and "4 times" in said and "enough memory" in said and "\n" not in said
+
+
+def test_an_iteration_that_is_left_early_begins_no_others(found: tuple[Path, dict[str, Any]]) -> None:
+    """Of forty tasks three are with Ray, whose two workers do what comes next. Nothing is cancelled."""
+    index, result = found[1]["first"]
+    assert 0 <= index == result < 3
+    assert found[1]["after"] == [1, 2, 4, 8] and 1 <= found[1]["begun"] <= 3
