@@ -191,6 +191,7 @@ def table(rows: list[Row]) -> str:
             "deviation_m",
             "duty_error",
             "phase_error",
+            "pattern_error",
             "suspended",
         ):
             values = [row[name] for row in of_speed if row.get(name) is not None]

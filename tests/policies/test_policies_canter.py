@@ -138,6 +138,18 @@ def test_late_and_short_steps_are_measured() -> None:
     assert score.duty_error == pytest.approx(0.1, abs=0.01) and score.phase_error == pytest.approx(
         0.1, abs=0.01
     )
+    # All feet are late alike: the gait itself is kept.
+    assert score.pattern_error < 0.01
+
+
+def test_a_trot_has_another_pattern_than_the_canter() -> None:
+    """By hand: RL is 0.2 turns early and FR 0.2 late for the plan; the others and the mean are in time."""
+    time_s, _ = contacts()
+    trot = ContactSchedule(touchdown=(0.5, 0.0, 0.0, 0.5))
+    force = 60.0 * trot.stance(time_s * 2.5 - 0.3)
+    score = gait_score(time_s, force, clock_hz=2.5, touchdown=SCHEDULE.touchdown, duty=SCHEDULE.duty)
+    assert score is not None and score.pattern_error == pytest.approx(0.1, abs=0.01)
+    assert score.phase_error == pytest.approx((0.3 + 0.5 + 0.1 + 0.3) / 4, abs=0.01)
 
 
 def test_bounces_are_no_steps_and_a_standing_robot_has_no_phase() -> None:
@@ -151,6 +163,7 @@ def test_bounces_are_no_steps_and_a_standing_robot_has_no_phase() -> None:
         time_s, np.full_like(force, 40.0), clock_hz=2.5, touchdown=SCHEDULE.touchdown, duty=SCHEDULE.duty
     )
     assert still is not None and np.isnan(still.phase).all() and np.isnan(still.phase_error)
+    assert np.isnan(still.pattern_error)
     np.testing.assert_allclose(still.duty, 1.0)
     assert gait_score(time_s[:50], force[:50], clock_hz=2.5, touchdown=(0.0,) * 4, duty=0.4) is None
 

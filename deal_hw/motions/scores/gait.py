@@ -31,6 +31,8 @@ class GaitScore:
         steps: Touchdowns of each foot in a turn of the clock, (F,); 1 for a foot in time.
         duty_error: Mean over the feet of the absolute difference from the planned duty.
         phase_error: Mean over all touchdowns of the distance from the planned phase [turns]; NaN without any.
+        pattern_error: Mean distance of the feet's phases from the plan if the plan may begin at any time
+            [turns]: small for a policy that keeps the gait but not the clock. NaN if a foot never comes down.
         suspended: Share of the time in which no foot was on the floor.
     """
 
@@ -40,6 +42,7 @@ class GaitScore:
     steps: FloatArray
     duty_error: float
     phase_error: float
+    pattern_error: float
     suspended: float
 
 
@@ -105,5 +108,12 @@ def gait_score(
         steps=steps,
         duty_error=float(np.abs(shares - duty).mean()),
         phase_error=float(every.mean()) if every.size else float("nan"),
+        pattern_error=_pattern_error(phase - plan),
         suspended=float((~down[judged].any(axis=1)).mean()),
     )
+
+
+def _pattern_error(late: FloatArray) -> float:
+    """Return the mean distance of phases from their plan, (F,) [turns], less what all feet have in common."""
+    shift = np.angle(np.exp(2j * np.pi * late).mean()) / (2 * np.pi)
+    return float(np.abs((late - shift + 0.5) % 1.0 - 0.5).mean())
