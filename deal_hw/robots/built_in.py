@@ -132,6 +132,7 @@ GO2: Final = RobotEntry(
     tasks={"canter": "deal_hw.policies.tasks:CANTER", "climb": "deal_hw.policies.tasks:CLIMB"},
     policies={
         "canter": "deal_hw.policies:assets/go2_canter.onnx",
+        "canter_amp": "deal_hw.policies:assets/go2_canter_amp.onnx",
         "climb": "deal_hw.policies:assets/go2_climb.onnx",
         "climb_rma": "deal_hw.policies:assets/go2_climb_rma.onnx",
     },

@@ -36,8 +36,8 @@ class DeploySettings(RunOptions):
     """The robot, such as cartpole."""
 
     policy: File | None = None
-    """The policy (.onnx), or canter, climb or climb_rma for one that is shipped for a Go2; by default the
-    robot's usual one."""
+    """The policy (.onnx), or canter, canter_amp, climb or climb_rma for one that is shipped for a Go2; by
+    default the robot's usual one."""
 
     seconds: RunSeconds = 10.0
     """Length of an episode [s]."""

@@ -122,6 +122,25 @@ def test_the_shipped_climb_with_adaptation_belongs_to_its_record() -> None:
     np.testing.assert_allclose(mine, policy.act_batch(seen), atol=1e-4)
 
 
+def test_the_shipped_imitation_belongs_to_its_record() -> None:
+    """It observes what the canter does; nothing of a gait was paid for."""
+    from deal_hw.policies.amp import AmpConfig, AmpTrainer
+    from deal_hw.policies.onnx_runtime import OnnxPolicy
+
+    path = required_policy("go2", "canter_amp")
+    policy = OnnxPolicy(path)
+    record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    assert record["onnx_sha256"] == policy.digest and record["spec_digest"] == policy.spec.digest()
+    assert policy.spec.training["algorithm"] == "amp" and 0.2 < policy.spec.training["style"] < 0.8
+    assert record["task"]["schedule_weight"] == record["task"]["gait_weight"] == 0.0
+    env = training_task("go2", "canter").make(
+        recorded_description("go2"), nominal_distribution("go2", "canter"), 2
+    )
+    assert policy.spec.observation == env.layout.observation and path.stat().st_size < 200_000
+    learner = AmpTrainer().learner(env, AmpConfig())
+    learner.load(learner.read(path.with_suffix(".safetensors"), env.layout), whole=False)
+
+
 def test_a_policy_is_a_file_or_a_task(tmp_path: Path) -> None:
     """A file of the name comes first; a name that is neither is a file that is missing."""
     assert policy_file("go2", None) == required_policy("go2")
