@@ -6,6 +6,8 @@ Nothing is imported or run, so the sources may be those of another checkout.
 from __future__ import annotations
 
 import ast
+import contextlib
+import gc
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -132,13 +134,26 @@ def read_sources(root: Path) -> dict[str, SourceFile]:
     """Return every Python file of a checkout's packages, by its module."""
     packages = package_folders(root)
     found = {}
-    for top in sorted({folder.split("/")[0] for folder in packages}):
-        for file in sorted((root / top).rglob("*.py")):
-            path = PurePosixPath(file.relative_to(root).as_posix())
-            text = file.read_text(encoding="utf-8")
-            module = module_name(path, packages)
-            found[module] = SourceFile(path, module, text, ast.parse(text, str(path)))
+    with without_garbage_collection():
+        for top in sorted({folder.split("/")[0] for folder in packages}):
+            for file in sorted((root / top).rglob("*.py")):
+                path = PurePosixPath(file.relative_to(root).as_posix())
+                text = file.read_text(encoding="utf-8")
+                module = module_name(path, packages)
+                found[module] = SourceFile(path, module, text, ast.parse(text, str(path)))
     return found
+
+
+@contextlib.contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Search for no garbage: all nodes are kept, and to visit them takes three times as long as to parse."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def absolute(source: str, package: str) -> str:

@@ -23,6 +23,7 @@ from deal_hw.workflows.options import FROM_PYTHON, from_settings, given, refuse
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.commander import who
 from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.unitree import Go2Link, QuadrupedLink, UnitreeLink
 
 OBEY_S = 5.0
 """How long a run may take after a request to end until its robot is passive [s]. It takes 0.25 s at most
@@ -86,7 +87,7 @@ class StopCartpoleSettings(StopSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StopGo2Settings(StopSettings):
+class StopGo2Settings(Go2Link, StopSettings):
     """Make a Go2 passive at once, from any terminal: damping. Nothing is asked.
 
     A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
@@ -94,21 +95,9 @@ class StopGo2Settings(StopSettings):
     The exit code is 0 only if the robot confirmed that it is passive.
     """
 
-    transport: Literal["dds", "zenoh"] = "dds"
-    """Transport to the Go2."""
-
-    state_check: Literal["strict", "length"] = "strict"
-    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
-
-    simulator: Literal["none", "unitree_mujoco"] = "none"
-    """Simulator in place of a real Go2: unitree_mujoco."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options. Over a bridge with certificates, that of a controller."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class StopB2Settings(StopSettings):
+class StopB2Settings(QuadrupedLink, StopSettings):
     """Make a B2 passive at once, from any terminal: damping. Nothing is asked.
 
     A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
@@ -116,30 +105,15 @@ class StopB2Settings(StopSettings):
     The exit code is 0 only if the robot confirmed that it is passive.
     """
 
-    transport: Literal["dds", "zenoh"] = "dds"
-    """Transport to the B2."""
-
-    state_check: Literal["strict", "length"] = "strict"
-    """How to check a B2's state messages: strict (length, head and checksum), or length alone."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class StopG1Settings(StopSettings):
+class StopG1Settings(UnitreeLink, StopSettings):
     """Make a G1 passive at once, from any terminal: damping. Nothing is asked. On the floor it falls.
 
     A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
     program then does it. It sends nothing while another program or the robot's own controller has the robot.
     The exit code is 0 only if the robot confirmed that it is passive.
     """
-
-    transport: Literal["dds", "zenoh"] = "dds"
-    """Transport to the G1."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
 
 
 STOP = robot_kinds(
@@ -222,8 +196,7 @@ def _transport(settings: StopSettings) -> str:
 
 def _wire(settings: StopSettings) -> WireOptions:
     """Return the network options; the usual ones of a robot that has none."""
-    wire: WireOptions | None = getattr(settings, "wire", None)
-    return wire or WireOptions()
+    return settings.wire if isinstance(settings, UnitreeLink) else WireOptions()
 
 
 def _claim(settings: StopSettings) -> str:
@@ -311,11 +284,7 @@ def _directly(settings: StopSettings, clock: Clock, say: Say) -> StopReport:
         return StopReport(robot=settings.robot, passive=passive, words=words)
 
     transport = _transport(settings)
-    own = {
-        name: getattr(settings, name)
-        for name in ("state_check", "simulator")
-        if getattr(settings, name, "none") not in ("strict", "none")
-    }
+    own = settings.driver_settings() if isinstance(settings, UnitreeLink) else {}
     robot = make_robot(settings.robot, transport, settings.port, clock, _wire(settings), own)
     try:
         with contextlib.ExitStack() as held:

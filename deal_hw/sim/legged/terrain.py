@@ -11,16 +11,19 @@ import copy
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 
 from deal_hw.errors import ConfigurationError, shown
-from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    # An emulated robot has terrain too, and no batch: loading that takes 0.3 s.
+    from deal_hw.sim.engine.batch import ServoBatch
 
 Kind = Literal["box", "slope"]
 

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from deal_hw.sim.parameters.body import movable_centre
 from deal_hw.sim.parameters.fields import Array, Fields, element_id
@@ -76,8 +76,10 @@ def shape(fields: Fields, element: str, values: Mapping[str, Array]) -> None:
     if np.linalg.det(frame) < 0:
         # Moments of mass have no sign, but a frame must be right-handed: both turn the same axis around.
         axes = axes * np.array([1.0, 1.0, -1.0])
-    nominal = Rotation.from_quat(fields.model.body_iquat[body], scalar_first=True)
-    found = nominal * Rotation.from_matrix(frame @ axes)
+    # Loaded on use: it takes longer than all else that an emulator imports.
+    rotation = scipy.spatial.transform.Rotation
+    nominal = rotation.from_quat(fields.model.body_iquat[body], scalar_first=True)
+    found = nominal * rotation.from_matrix(frame @ axes)
     quat = fields.get("body_iquat")
     quat[:, body] = np.where(
         upright[:, None], fields.model.body_iquat[body], found.as_quat(scalar_first=True, canonical=True)

@@ -30,6 +30,7 @@ from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.options import from_settings, given, refuse
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.say import html_table
+from deal_hw.workflows.unitree import Go2Link, QuadrupedLink, UnitreeLink
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,68 +76,43 @@ class DoctorCartpoleSettings(DoctorRobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorGo2Settings(DoctorRobotSettings):
-    """Check this computer, the connection and a Go2; sends no command to a motor.
+class DoctorUnitreeSettings(UnitreeLink, DoctorRobotSettings):
+    """Check this computer, the connection and a robot of Unitree; sends no command to a motor.
 
     The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
     """
 
     port: str
-    """The Go2's port: a network interface (dds) or an end point (zenoh)."""
-
-    transport: Literal["dds", "zenoh"] = "dds"
-    """Transport to the Go2."""
-
-    state_check: Literal["strict", "length"] = "strict"
-    """How to check a Go2's state messages: strict (length, head and checksum), or length alone."""
-
-    simulator: Literal["none", "unitree_mujoco"] = "none"
-    """Simulator in place of a real Go2: unitree_mujoco."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.simulator != "none":
-            refuse(given(self, DoctorGo2Settings, ("state_check",)), f"{self.simulator} has no checksums")
+    """The robot's port: a network interface (dds) or an end point (zenoh)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorB2Settings(DoctorRobotSettings):
-    """Check this computer, the connection and a B2; sends no command to a motor.
-
-    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
-    """
-
-    port: str
-    """The B2's port: a network interface (dds) or an end point (zenoh)."""
-
-    transport: Literal["dds", "zenoh"] = "dds"
-    """Transport to the B2."""
-
-    state_check: Literal["strict", "length"] = "strict"
-    """How to check a B2's state messages: strict (length, head and checksum), or length alone."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DoctorG1Settings(DoctorRobotSettings):
+class DoctorG1Settings(DoctorUnitreeSettings):
     """Check this computer, the connection and a G1; sends no command to a motor.
 
     The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
     """
 
-    port: str
-    """The G1's port: a network interface (dds) or an end point (zenoh)."""
 
-    transport: Literal["dds", "zenoh"] = "dds"
-    """Transport to the G1."""
+@dataclass(frozen=True, kw_only=True)
+class DoctorB2Settings(QuadrupedLink, DoctorUnitreeSettings):
+    """Check this computer, the connection and a B2; sends no command to a motor.
 
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorGo2Settings(Go2Link, DoctorUnitreeSettings):
+    """Check this computer, the connection and a Go2; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.simulator != "none":
+            refuse(given(self, DoctorGo2Settings, ("state_check",)), f"{self.simulator} has no checksums")
 
 
 DOCTOR = robot_kinds(
@@ -214,12 +190,8 @@ def _examine_link(config: DoctorRobotSettings, name: str, clock: Clock) -> Itera
 
     entry, wire = reached_over(config.robot, name)
     network, own = WireOptions(), dict[str, str]()
-    if isinstance(config, DoctorGo2Settings):
-        network, own = config.wire, {"state_check": config.state_check, "simulator": config.simulator}
-    if isinstance(config, DoctorB2Settings):
-        network, own = config.wire, {"state_check": config.state_check}
-    if isinstance(config, DoctorG1Settings):
-        network = config.wire
+    if isinstance(config, UnitreeLink):
+        network, own = config.wire, config.driver_settings()
     if wire.doctor:
         link = make_topic_transport(wire.transport, config.port, clock, network)
         yield from entry.load(wire.doctor)(link, clock, config.seconds, **own).run()

@@ -11,10 +11,10 @@ from deal_hw.motions.posture import PostureConfig
 from deal_hw.parameters import LONGEST_LATENCY_S
 from deal_hw.ranges import Checked, Range, option
 from deal_hw.robots import default_transport, driver_description, no_driver
-from deal_hw.transport import WireOptions
 from deal_hw.workflows.options import FROM_PYTHON, File, Ratio, Seed, given, refuse
 from deal_hw.workflows.robot import named
 from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.unitree import Go2Link, QuadrupedLink, UnitreeLink
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,38 +76,23 @@ class CartpoleLinkOptions(LinkOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class B2LinkOptions(LinkOptions):
+class UnitreeLinkOptions(UnitreeLink, LinkOptions):
+    """The connection to a robot of Unitree, beyond the port."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class B2LinkOptions(QuadrupedLink, UnitreeLinkOptions):
     """The connection to a B2, beyond the port."""
 
-    transport: Literal["dds", "zenoh"] = "dds"
-    """The transport."""
-
-    state_check: Literal["strict", "length"] = "strict"
-    """How to check the state messages: strict (length, head and checksum), or length alone, for firmware or
-    simulators with another head or checksum. With length alone corrupted states are not detected."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class Go2LinkOptions(B2LinkOptions):
+class Go2LinkOptions(Go2Link, UnitreeLinkOptions):
     """The connection to a Go2, beyond the port."""
 
-    simulator: Literal["none", "unitree_mujoco"] = "none"
-    """The simulator that runs in place of a Go2: unitree_mujoco, whose states lack head, clock, checksum and
-    battery. A real robot is then refused."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class G1LinkOptions(LinkOptions):
+class G1LinkOptions(UnitreeLinkOptions):
     """The connection to a G1, beyond the port."""
-
-    transport: Literal["dds", "zenoh"] = "dds"
-    """The transport."""
-
-    wire: WireOptions = field(default_factory=WireOptions)
-    """Network options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,36 +148,36 @@ class CartpoleRunOptions(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Go2RunOptions(RunOptions):
-    """Options of every verb that runs a Go2."""
+class UnitreeRunOptions(RunOptions):
+    """Options of every verb that runs a robot of Unitree."""
 
     port: str
     """The robot's port: a network interface such as enp2s0 (dds), or an end point such as
     tcp/127.0.0.1:7447 (zenoh)."""
+
+    link: UnitreeLinkOptions = field(default_factory=UnitreeLinkOptions)
+    """The connection to the robot, beyond the port."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Go2RunOptions(UnitreeRunOptions):
+    """Options of every verb that runs a Go2."""
 
     link: Go2LinkOptions = field(default_factory=Go2LinkOptions)
     """The connection to the robot, beyond the port."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class B2RunOptions(RunOptions):
+class B2RunOptions(UnitreeRunOptions):
     """Options of every verb that runs a B2."""
-
-    port: str
-    """The robot's port: a network interface such as enp2s0 (dds), or an end point such as
-    tcp/127.0.0.1:7447 (zenoh)."""
 
     link: B2LinkOptions = field(default_factory=B2LinkOptions)
     """The connection to the robot, beyond the port."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class G1RunOptions(RunOptions):
+class G1RunOptions(UnitreeRunOptions):
     """Options of every verb that runs a G1."""
-
-    port: str
-    """The robot's port: a network interface such as enp2s0 (dds), or an end point such as
-    tcp/127.0.0.1:7447 (zenoh)."""
 
     link: G1LinkOptions = field(default_factory=G1LinkOptions)
     """The connection to the robot, beyond the port."""
@@ -284,7 +269,7 @@ def plan_options(
         "record_wire": link.record_wire,
         "robot_settings": _settings(link, legs, crane),
     }
-    if isinstance(link, B2LinkOptions | G1LinkOptions):
+    if isinstance(link, UnitreeLink):
         options["wire"] = link.wire
     if legs is None:
         return {**options, "stand": False}
@@ -310,16 +295,15 @@ def _settings(link: LinkOptions, legs: StandOptions | None, crane: CraneOptions 
     own: tuple[tuple[Any, Any, tuple[str, ...]], ...] = (
         (legs, StandOptions, ("stop_buttons", "support_check")),
         (crane, CraneOptions, ("stop_buttons", "hung_on_crane")),
-        (link, B2LinkOptions, ("state_check",)),
-        (link, Go2LinkOptions, ("simulator",)),
     )
-    return {
+    given_here = {
         name: getattr(options, name)
         for options, settings, names in own
         if isinstance(options, settings)
         for name in names
         if getattr(options, name) != getattr(settings, name)
     }
+    return {**given_here, **(link.driver_settings() if isinstance(link, UnitreeLink) else {})}
 
 
 def _stands(description: RobotDescription) -> bool:
