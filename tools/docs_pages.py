@@ -148,6 +148,7 @@ def describe(parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
 def cli_page() -> str:
     """Return the reference of the command line."""
     main: ModuleType = importlib.import_module("deal_hw.cli.main")
+    table: ModuleType = importlib.import_module("deal_hw.cli.verbs")
     lines = [
         "# Command line",
         "",
@@ -159,7 +160,7 @@ def cli_page() -> str:
     ]
     lines += [
         f"| [`{name}`](#deal-hw-{name}) | {cell(verb.help)} | {code(verb.extra) if verb.extra else ''} |"
-        for name, verb in main.VERBS.items()
+        for name, verb in table.VERBS.items()
     ]
     lines += [
         "",
@@ -171,7 +172,7 @@ def cli_page() -> str:
         f"{main.EXIT_INTERRUPTED} stopped by Ctrl-C; {main.EXIT_PIPE} the reader of the output closed it.",
         "",
     ]
-    for name, verb in main.VERBS.items():
+    for name, verb in table.VERBS.items():
         settings = getattr(importlib.import_module(verb.module), verb.config)
         lines += [f"## deal-hw {name}", "", f"    deal-hw {verb.example}", ""]
         if not isinstance(settings, Kinds):

@@ -18,7 +18,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -27,10 +26,6 @@ from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from deal_hw.calib.fit.residual import WindowRows
-
 
 EARLIER_COMMANDS = 8
 """Commands before a window whose delays still count [-]: a slewing set-point is behind until it arrives."""
@@ -192,14 +187,24 @@ class FreeRows:
     parameter: FloatArray
 
 
-def free_rows(rows: WindowRows, columns: FloatArray) -> FreeRows:
-    """Return linearised residuals, and columns of :func:`delay_columns`, without the start states."""
-    W, _, S = rows.start.shape
+def free_rows(
+    residual: FloatArray, parameter: FloatArray, start: FloatArray, columns: FloatArray
+) -> FreeRows:
+    """Return linearised residuals, and columns of :func:`delay_columns`, without the start states.
+
+    Args:
+        residual: Of an episode's windows, whitened for the sensors' noise, (W, R); the last S rows are the
+            prior of the start states.
+        parameter: Their derivatives by the fitted values, (W, R, K + 1).
+        start: Their derivatives by the start states, (W, R, S).
+        columns: Their derivatives by the commands' delays without the last S rows, (W, R - S, P) [1/s].
+    """
+    W, _, S = start.shape
     columns = np.concatenate([columns, np.zeros((W, S, columns.shape[2]))], axis=1)
     if not S:
-        return FreeRows(rows.residual, columns, rows.parameter)
-    across = np.swapaxes(np.linalg.qr(rows.start, mode="complete")[0][:, :, S:], 1, 2)
-    return FreeRows((across @ rows.residual[..., None])[..., 0], across @ columns, across @ rows.parameter)
+        return FreeRows(residual, columns, parameter)
+    across = np.swapaxes(np.linalg.qr(start, mode="complete")[0][:, :, S:], 1, 2)
+    return FreeRows((across @ residual[..., None])[..., 0], across @ columns, across @ parameter)
 
 
 def moved_commands(

@@ -146,7 +146,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
                 break
             if (seen := _seen(delayed, fit)) is None:
                 break
-            free = [free_rows(r, c) for r, c in zip(*seen, strict=True)]
+            free = [free_rows(r.residual, r.parameter, r.start, c) for r, c in zip(*seen, strict=True)]
             moved, shift, changed = moved_commands(delayed, fit.shooting.data, free, std_s)
             if not changed:
                 break
@@ -189,7 +189,7 @@ def _likely(
     problem: Problem, fit: Refined, rows: Sequence[WindowRows], columns: Sequence[FloatArray]
 ) -> tuple[float, float]:
     """Return the likeliest standard deviation of the delays [s] at a fit, and its gain in deviance."""
-    free = [free_rows(r, c) for r, c in zip(rows, columns, strict=True)]
+    free = [free_rows(r.residual, r.parameter, r.start, c) for r, c in zip(rows, columns, strict=True)]
     width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
     return likely_std(
         [f.residual for f in free],

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
 
 from deal_hw.cli.arguments import Option, options_of
+from deal_hw.cli.verbs import Verb
 from deal_hw.errors import ConfigurationError
 from deal_hw.robots import driven_robots
 from deal_hw.workflows.kinds import Kinds, one_kind
-
-if TYPE_CHECKING:
-    from deal_hw.cli.main import Verb
 
 SHELLS = ("bash", "zsh")
 

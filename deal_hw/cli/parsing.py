@@ -11,7 +11,7 @@ import textwrap
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin
 
 import tyro
 from tyro.constructors import (
@@ -24,14 +24,12 @@ from tyro.constructors import (
 )
 
 from deal_hw.cli.arguments import CommandLine, check, is_positional, options_of
+from deal_hw.cli.verbs import Verb
 from deal_hw.documentation import with_places
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.ranges import option
 from deal_hw.workflows.kinds import InputKind, Kinds, MissingKindError, one_kind
 from deal_hw.workflows.options import FROM_PYTHON, OneWord
-
-if TYPE_CHECKING:
-    from deal_hw.cli.main import Verb
 
 HELP_ALL = "--help-all"
 _HELP_WORDS = ("-h", "--help", HELP_ALL)

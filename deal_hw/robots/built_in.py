@@ -136,6 +136,7 @@ GO2: Final = RobotEntry(
         "climb": "deal_hw.policies:assets/go2_climb.onnx",
         "climb_rma": "deal_hw.policies:assets/go2_climb_rma.onnx",
     },
+    truth="deal_hw.drivers.go2.emulator.truth:Go2Truth",
     motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
 )
 GO2_ON_STAND: Final = RobotEntry(
@@ -156,6 +157,7 @@ B2: Final = RobotEntry(
     spaces="deal_hw.drivers.b2.description:SPACES",
     odometry="deal_hw.drivers.b2.odometry:walked",
     sway="deal_hw.drivers.go2.motions:sway_plan",
+    truth="deal_hw.drivers.b2.emulator:B2Truth",
     motors="deal_hw.drivers.go2.messages.wire:WIRE_JOINTS",
 )
 B2_ON_STAND: Final = RobotEntry(

@@ -128,6 +128,8 @@ class RobotEntry:
         policy: The shipped policy, ``"package:file"``.
         tasks: Further training tasks, as ``task``, by name.
         policies: Further shipped policies, as ``policy``: those of these tasks by their names, and others.
+        truth: The class of the hidden parameters of its emulator, where that also emulates other robots: a
+            :class:`~deal_hw.drivers.unitree.emulated_quadruped.QuadrupedTruth`.
         motors: The joints in the order of the vendor's motor numbers, by which policies of other trainers
             name them.
         needs: What pip installs for it; named where an import fails.
@@ -152,6 +154,7 @@ class RobotEntry:
     policy: str = ""
     tasks: Mapping[str, Reference] = field(default_factory=dict)
     policies: Mapping[str, str] = field(default_factory=dict)
+    truth: Reference = ""
     motors: Reference = ""
     needs: str = ""
     origin: str = ""

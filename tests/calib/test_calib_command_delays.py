@@ -23,7 +23,7 @@ from deal_hw.calib.fit.command_delays import (
 )
 from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
-from deal_hw.calib.fit.residual import Shooting, WindowRows
+from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.search.eki import Eki
@@ -57,8 +57,8 @@ def test_whitened_errors_have_unit_covariance(noisy: Case, noisy_problem: Proble
     np.testing.assert_array_equal(late.measured, data.measured)
 
 
-def _delayed(std_s: float, seed: int) -> tuple[WindowRows, FloatArray]:
-    """Return residuals of 12 windows with 20 commands each, which a fit has followed, and the columns."""
+def _delayed(std_s: float, seed: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return residuals of 12 windows with 20 commands each, which a fit followed, and their derivatives."""
     rng = np.random.default_rng(seed)
     columns = np.cumsum(np.repeat(rng.standard_normal((12, 20, 1)), 6, axis=1) * 100.0, axis=1)
     columns = np.where(np.arange(120)[:, None] // 6 >= np.arange(20), columns, 0.0)
@@ -67,8 +67,7 @@ def _delayed(std_s: float, seed: int) -> tuple[WindowRows, FloatArray]:
     fit = np.linalg.lstsq(followed.reshape(-1, 8), residual.ravel(), rcond=None)[0]
     last = ((0, 0), (0, 1))
     start = np.concatenate([np.ones((12, 120, 1)), np.full((12, 1, 1), 1e-3)], axis=1)
-    rows = np.pad(residual - followed @ fit, last), np.pad(followed, (*last, (0, 0)))
-    return WindowRows(*rows, start), columns
+    return np.pad(residual - followed @ fit, last), np.pad(followed, (*last, (0, 0))), start, columns
 
 
 @pytest.mark.parametrize("std_s", [0.3e-3, DELAY_S])

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from deal_hw.cli.completion import completion
-from deal_hw.cli.main import EXIT_ERROR, VERBS, main
+from deal_hw.cli.main import EXIT_ERROR, main
+from deal_hw.cli.verbs import VERBS
 from deal_hw.robots import driven_robots
 
 pytestmark = pytest.mark.real_time

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from verb_options import Option, dataclasses_of, kind_of, options
 
-from deal_hw.cli.main import VERBS, parse
+from deal_hw.cli.main import parse
+from deal_hw.cli.verbs import VERBS
 from deal_hw.clock import VirtualClock
 from deal_hw.control.process.channel import Outcome
 from deal_hw.errors import DealHwError

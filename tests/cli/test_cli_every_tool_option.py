@@ -22,7 +22,8 @@ from fakes import foreign_policy
 from fakes.foreign_policy import Foreign
 from verb_options import Option, kind_of, options
 
-from deal_hw.cli.main import VERBS, main, parse
+from deal_hw.cli.main import main, parse
+from deal_hw.cli.verbs import VERBS
 from deal_hw.errors import DealHwError
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import robot_entry

@@ -18,6 +18,7 @@ import deal_hw
 from deal_hw.cli import main as cli
 from deal_hw.cli.completion import completion
 from deal_hw.cli.parsing import example_of
+from deal_hw.cli.verbs import Verb
 from deal_hw.errors import UnknownNameError
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import FROM_PYTHON, from_settings
@@ -103,7 +104,7 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     module, called = types.ModuleType("move_module"), list[Any]()
     module.__dict__.update(KINDS=KINDS.with_options(Quiet), move=called.append)
     monkeypatch.setitem(sys.modules, "move_module", module)
-    entry = cli.Verb(
+    entry = Verb(
         module="move_module", config="KINDS", function="move", help="move a robot", example="move cart"
     )
     monkeypatch.setattr(cli, "VERBS", {"move": entry})

@@ -14,7 +14,8 @@ import pytest
 from verb_options import dataclasses_of
 
 from deal_hw.calib.pipeline.methods import DEFAULT_SEARCH, METHODS, SEARCHES
-from deal_hw.cli.main import VERBS, main, run
+from deal_hw.cli.main import main, run
+from deal_hw.cli.verbs import VERBS
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.ranges import Range
 

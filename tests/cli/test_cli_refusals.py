@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.cli.main import EXIT_ERROR, VERBS, main
+from deal_hw.cli.main import EXIT_ERROR, main
+from deal_hw.cli.verbs import VERBS
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth

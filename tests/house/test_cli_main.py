@@ -19,6 +19,7 @@ import pytest
 import tyro
 
 from deal_hw.cli import main as cli
+from deal_hw.cli.verbs import JOBS, Verb
 from deal_hw.errors import ConfigurationError, MissingExtraError, PortNotFoundError, UnknownNameError
 from deal_hw.install import install_line
 from deal_hw.workflows.kinds import sub_verbs
@@ -57,7 +58,7 @@ def add_verb(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         module = types.ModuleType("probe_module")
         module.__dict__.update(Probe=config, probe=function)
         monkeypatch.setitem(sys.modules, "probe_module", module)
-        verb = cli.Verb(
+        verb = Verb(
             module="probe_module",
             config="Probe",
             function="probe",
@@ -79,7 +80,7 @@ def test_help_teaches_the_jobs_first(capsys: pytest.CaptureFixture[str]) -> None
         assert f"deal-hw {verb.example}\n" in text
     places = [text.index(f"\n  {name} ") for name in cli.VERBS]
     assert places == sorted(places)
-    assert list(cli.JOBS) == ["collect", "calibrate", "train", "deploy", "inspect"]
+    assert list(JOBS) == ["collect", "calibrate", "train", "deploy", "inspect"]
     assert max(map(len, text.splitlines())) <= 120
 
 

@@ -15,7 +15,7 @@ from syntax import walk
 
 import deal_hw
 from deal_hw import documentation
-from deal_hw.cli.main import VERBS
+from deal_hw.cli.verbs import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

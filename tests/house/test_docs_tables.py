@@ -10,7 +10,7 @@ from typing import get_args
 
 import pytest
 
-from deal_hw.cli.main import JOBS
+from deal_hw.cli.verbs import JOBS
 from deal_hw.control.safety.machine import SAFETY_FLAGS
 from deal_hw.data.recording.record import CycleFlag
 from deal_hw.data.recording.schemas import CHANNELS, STANDARD

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.errors import ConfigurationError, shown
 from deal_hw.motions.scores.velocity_error import Track
 from deal_hw.reading import reading
-from deal_hw.robots.entry import load
+from deal_hw.robots import robot_entry
 from deal_hw.workflows.emulation.common import choose_truth
 from deal_hw.workflows.emulation.settings import EmulateGo2Settings
 from deal_hw.workflows.emulation.topics import emulate_on_topics, of_every_robot
@@ -26,11 +26,6 @@ if TYPE_CHECKING:
     from deal_hw.drivers.go2.emulator.device import Go2Device
     from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
 
-TRUTHS: Final[Mapping[str, str]] = {
-    "go2": "deal_hw.drivers.go2.emulator.truth:Go2Truth",
-    "b2": "deal_hw.drivers.b2.emulator:B2Truth",
-}
-"""Hidden parameters of each quadruped: the class, as a reference."""
 TRACK_COLUMNS = ("time_s", "x", "y", "heading")
 TRACK_NS = 10_000_000
 
@@ -103,7 +98,8 @@ def read_track(path: Path) -> Track:
 def _truth(config: EmulateGo2Settings) -> QuadrupedTruth:
     from deal_hw.drivers.unitree.emulated_quadruped import DEFAULT_RANGE_RATIO
 
-    kind: type[QuadrupedTruth] = load(TRUTHS[config.robot], f"robot {config.robot!r}")
+    entry = robot_entry(config.robot)
+    kind: type[QuadrupedTruth] = entry.load(entry.truth)
     return choose_truth(config, kind.nominal, kind.draw, kind.from_json, DEFAULT_RANGE_RATIO)
 
 

@@ -314,7 +314,6 @@ _SETTINGS: dict[str, type[EmulateSettings]] = {
     "go2": EmulateGo2Settings,
     "b2": EmulateB2Settings,
     "g1": EmulateG1Settings,
-    "g1_23dof": EmulateG1Settings,
     "so101": EmulateArmSettings,
 }
 
@@ -325,12 +324,10 @@ _HELP = {
 
 
 def _table() -> dict[str, InputKind]:
-    found = {
-        name: InputKind(
-            _SETTINGS.get(name, EmulatePlugInSettings), _HELP.get(name, ""), example=f"{name} --seed 0"
-        )
-        for name in emulated_robots()
-    }
+    found = {}
+    for name in emulated_robots():
+        settings = _SETTINGS.get(name) or _SETTINGS.get(robot_entry(name).machine) or EmulatePlugInSettings
+        found[name] = InputKind(settings, _HELP.get(name, ""), example=f"{name} --seed 0")
     what = "Emulate the robot of a robot.yaml: its bytes on a port of its own, with hidden physics."
     return {**found, FILE: InputKind(EmulateArmSettings, what, example=f"{FILE} --seed 0")}
 
