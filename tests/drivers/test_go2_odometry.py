@@ -26,15 +26,25 @@ TOLERANCE_M_S = 0.04
 """Mean velocities of a part: feet slide where they land."""
 
 
-@pytest.fixture(scope="module")
-def walking(tmp_path_factory: pytest.TempPathFactory) -> VirtualWalk:
+def walk_for(seconds: float, folder: Path) -> VirtualWalk:
     """Walk ahead, then to the left and turning, with a robot that has hidden physics."""
-    folder = tmp_path_factory.mktemp("walk")
     script = ((0.0, (0.8, 0.0, 0.0)), (3.5, (0.0, 0.4, 0.6)))
     policy = OnnxPolicy(Path(str(shipped_policy("go2"))))
     source = ScriptVelocity(write_script(folder / "script.csv", script))
-    metadata = {"robot": "go2", "seconds": SECONDS}
-    return walk(draw_truth("realistic", SEED), policy, source, SECONDS, folder / "walk.mcap", metadata)
+    metadata = {"robot": "go2", "seconds": seconds}
+    return walk(draw_truth("realistic", SEED), policy, source, seconds, folder / "walk.mcap", metadata)
+
+
+@pytest.fixture(scope="module")
+def walking(tmp_path_factory: pytest.TempPathFactory) -> VirtualWalk:
+    """Walk both parts."""
+    return walk_for(SECONDS, tmp_path_factory.mktemp("walk"))
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> VirtualWalk:
+    """Stand up, and walk for half a second."""
+    return walk_for(0.5, tmp_path_factory.mktemp("begun"))
 
 
 def by_truth(walking: VirtualWalk) -> VelocityError:
@@ -61,9 +71,9 @@ def test_legs_and_imu_tell_the_velocity_to_4_cm_a_second(walking: VirtualWalk) -
     assert own.velocity_m_s == pytest.approx(true.velocity_m_s, abs=TOLERANCE_M_S)
 
 
-def test_the_standing_robot_weighs_itself(walking: VirtualWalk) -> None:
+def test_the_standing_robot_weighs_itself(begun: VirtualWalk) -> None:
     """Before it walks, by its motors' efforts: its hidden payload comes out to 0.3 kg."""
-    recorded = walking.trajectory
+    recorded = begun.trajectory
     assert recorded is not None and recorded.body is not None
     wanted = wanted_velocity(recorded)
     assert wanted is not None
@@ -77,7 +87,7 @@ def test_the_standing_robot_weighs_itself(walking: VirtualWalk) -> None:
     assert mass == pytest.approx(float(robot.model.body_mass.sum()) + payload, abs=0.3)
 
 
-def test_a_robot_without_legs_does_not_walk(walking: VirtualWalk) -> None:
+def test_a_robot_without_legs_does_not_walk(begun: VirtualWalk) -> None:
     """Nothing is computed for a cart-pole."""
-    assert walking.trajectory is not None
-    assert walked("cartpole", walking.trajectory) is None
+    assert begun.trajectory is not None
+    assert walked("cartpole", begun.trajectory) is None

@@ -65,6 +65,7 @@ def found(recorded: Path) -> deal_hw.Calibration:
     return _calibrate(recorded, holdout=[recorded / "third.csv"])
 
 
+@pytest.mark.slow
 def test_zeros_that_differ_are_found_and_named(found: deal_hw.Calibration) -> None:
     """With their true values, of two joints in two recordings; the damping is right, and nothing is left."""
     result = found.result
@@ -82,6 +83,7 @@ def test_zeros_that_differ_are_found_and_named(found: deal_hw.Calibration) -> No
     assert result.provenance["diagnosis"][0]["cause"] == "zero"
 
 
+@pytest.mark.slow
 def test_a_held_out_recording_gets_its_own_zero(found: deal_hw.Calibration) -> None:
     """Fitted to it alone."""
     zeros = found.result.provenance["heldout_rmse"]["zeros"]["calibrated"]
@@ -89,6 +91,7 @@ def test_a_held_out_recording_gets_its_own_zero(found: deal_hw.Calibration) -> N
         assert zeros[joint]["third.csv"] == pytest.approx(bias, abs=0.001)
 
 
+@pytest.mark.slow
 def test_policies_meet_other_zeros(found: deal_hw.Calibration) -> None:
     """The distribution for training has one zero of each joint, spread as those of the recordings."""
     distribution = found.distribution
