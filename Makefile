@@ -41,7 +41,7 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## the whole loop on an emulated cart-pole
 	$(BIN)/deal-hw demo $(DEMO_ARGS)
 
-# Tests that need the DDS peer or a chip's tools are skipped without them, and say what to install. One thread of
+# Tests that need a DDS peer or a chip's tools are skipped without them, and say what to install. One thread of
 # OpenMP a process: with more, the workers' threads wait for each other on two cores. Three workers: the one with the
 # tests in real time (tests/conftest.py) mostly waits, and the two that compute give way to it. Bytecode is written even
 # where the environment forbids it: else each worker compiles all tests, and each of some hundred processes the package.
@@ -54,11 +54,13 @@ test-slow: $(STAMP) test-peers ## the other tests: long searches and calibration
 
 test-peers:
 	@tools/build_dds_peer.sh || true
+	@tools/build_fastdds_peer.sh || true
 	@tools/install_avr_tools.sh || true
 	@tools/install_arm_tools.sh || true
 
-dds-peer: ## build the test peer on Cyclone DDS 0.10.2, installing what it needs
+dds-peer: ## build the test peers on Cyclone DDS 0.10.2 and Fast DDS 2.9, with what they need
 	@tools/build_dds_peer.sh
+	@tools/build_fastdds_peer.sh
 
 avr-tools: ## install gcc-avr and simavr
 	@tools/install_avr_tools.sh

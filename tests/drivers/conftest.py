@@ -94,15 +94,26 @@ def make_go2() -> Callable[..., Go2Bench]:
     return Go2Bench
 
 
+def built(script: str, command: str) -> Path:
+    """Return the folder of a program, built if all that it needs is installed; else skip the test."""
+    done = subprocess.run(
+        [ROOT / "tools" / script, "--no-install"], capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        pytest.skip(f"{command}, or: {done.stderr.strip().splitlines()[-1]}")
+    return ROOT / "build" / script.removeprefix("build_").removesuffix(".sh")
+
+
 @pytest.fixture(scope="session")
 def dds_peer() -> Path:
     """The C program on Cyclone DDS 0.10.2; packages are only installed by `make dds-peer`."""
-    built = subprocess.run(
-        [ROOT / "tools/build_dds_peer.sh", "--no-install"], capture_output=True, text=True, check=False
-    )
-    if built.returncode != 0:
-        pytest.skip(f"make dds-peer, or: {built.stderr.strip().splitlines()[-1]}")
-    return ROOT / "build/dds_peer/go2_peer"
+    return built("build_dds_peer.sh", "make dds-peer") / "go2_peer"
+
+
+@pytest.fixture(scope="session", params=["build_dds_peer.sh", "build_fastdds_peer.sh"])
+def ros2_peer(request: pytest.FixtureRequest) -> Path:
+    """The program for robots of ros2_control, in C on Cyclone DDS 0.10.2 and in C++ on Fast DDS 2.9."""
+    return built(request.param, "make dds-peer") / "ros2_peer"
 
 
 @pytest.fixture
