@@ -5,8 +5,8 @@
 
 FOLDER holds your own checkouts: ODriveResources (odriverobotics), DynamixelSDK (ROBOTIS-GIT),
 FTServo_Python (ftservo), lerobot (huggingface, v0.4.4: later versions need Python 3.12) and
-unitree_sdk2_python (unitreerobotics). What is not
-there is left out. Programs run unchanged, but for the port or bus that they open by name
+unitree_sdk2_python (unitreerobotics). What is not there is left out. Programs run unchanged, but for the
+port or bus that they open by name, and packages that they import and do not use, which are empty
 (tools/clients/sitecustomize.py), in a terminal where this tool presses the keys. Each has its own emulator. A
 program that fails is run again, up to three times in all, because its time limits are short for a busy
 machine; table and transcript show at which try it passed, what was wrong before, and the load at each try.
@@ -232,6 +232,7 @@ def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
         environment = os.environ | {
             "PYTHONPATH": os.pathsep.join(map(str, paths)),
             "DEAL_HW_CLIENT_PORTS": f"{client.opens}={port}" if client.opens else "",
+            "DEAL_HW_CLIENT_UNUSED": ",".join(client.unused),
         }
         return run_in_terminal(command, client, work, environment)
 

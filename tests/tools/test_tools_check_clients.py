@@ -21,9 +21,13 @@ pytestmark = pytest.mark.real_time
 PLAIN = Client(name="plain", source="plain.py", command=("{source}",), emulator=("cartpole",))
 
 
-def run_with(shim: str, code: str) -> str:
-    """Return what a program prints whose ports are replaced."""
-    environment = os.environ | {"PYTHONPATH": str(TOOLS), "DEAL_HW_CLIENT_PORTS": shim}
+def run_with(shim: str, code: str, unused: str = "") -> str:
+    """Return what a program prints whose ports are replaced, and whose unused packages are empty."""
+    environment = os.environ | {
+        "PYTHONPATH": str(TOOLS),
+        "DEAL_HW_CLIENT_PORTS": shim,
+        "DEAL_HW_CLIENT_UNUSED": unused,
+    }
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
     )
@@ -68,6 +72,16 @@ def test_a_can_interface_becomes_an_adapter() -> None:
     os.close(slave)
     assert out.startswith("0x1 aabbccdd00000000 True")
     assert b"S6\r" in received
+
+
+def test_an_unused_package_is_empty() -> None:
+    """It need not be installed; a program may import its parts and derive from their names; others stay."""
+    code = (
+        "import json, no_such.deep.part as part\nfrom no_such import v2\n"
+        "class Own(v2.Base): size = 3\nprint(Own().size, part.__name__, json.dumps([1]))"
+    )
+    assert run_with("", code, "no_such").split() == ["3", "no_such.deep.part", "[1]"]
+    assert "No module named 'no_such'" in run_with("", code, "no_other")
 
 
 def test_keys_are_pressed_when_they_are_asked_for(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ class Client:
         opens: The port or bus that the program opens by name; "" if it takes it as an argument.
         paths: Folders below the user's folder for PYTHONPATH.
         packages: Packages that it needs beside those of deal-hw.
+        unused: Packages that it imports and does not use here: they are empty, whatever is installed.
         own_python: Whether the user must name its Python, because no environment can be made for it here.
         prepare: What the user does before: "velocity" sets an ODrive to velocity control, "factory" resets
             servos, except id and rate.
@@ -52,6 +53,7 @@ class Client:
     opens: str = ""
     paths: tuple[str, ...] = ()
     packages: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
     own_python: bool = False
     prepare: Literal["", "velocity", "factory"] = ""
     files: tuple[Literal["endpoints", "config", "so101", "homed"], ...] = ()
@@ -202,8 +204,9 @@ CLIENTS: Final = (
         command=("{tools}/so_follower.py", "{port}", "{folder}"),
         emulator=("so101", "--profile", "ideal", "--nominal"),
         paths=("lerobot/src",),
+        # torchvision's wheels expect a torch with CUDA.
+        unused=("torchvision",),
         packages=(
-            "torchvision",
             "deepdiff",
             "tqdm",
             "draccus",

@@ -2,17 +2,24 @@
 
 Python runs this file at its start where the folder is on PYTHONPATH. ``DEAL_HW_CLIENT_PORTS`` holds pairs
 NAME=PORT, joined by commas: a serial port NAME opens PORT, a SocketCAN interface NAME opens the slcan adapter
-at PORT. Nothing else of a program is changed.
+at PORT. ``DEAL_HW_CLIENT_UNUSED`` holds names of packages, joined by commas, that a program imports and does
+not use here, and that need not work on this machine: they are empty. Nothing else of a program is changed.
 """
 
 from __future__ import annotations
 
+import importlib.abc
+import importlib.machinery
 import os
 import queue
+import sys
 import threading
+import types
+from collections.abc import Sequence
 from typing import Any
 
 _PORTS = dict(pair.split("=", 1) for pair in os.environ.get("DEAL_HW_CLIENT_PORTS", "").split(",") if pair)
+_UNUSED = tuple(name for name in os.environ.get("DEAL_HW_CLIENT_UNUSED", "").split(",") if name)
 _BITRATE = 500_000
 
 
@@ -80,3 +87,35 @@ for _patch in (_serial, _can) if _PORTS else ():
         _patch()
     except ImportError:  # A program that does not use it needs no such package.
         continue
+
+
+class _EmptyModule(types.ModuleType):
+    """Each name in it is an empty class, from which a program may derive its own."""
+
+    __path__: Sequence[str] = ()
+
+    def __getattr__(self, name: str) -> type:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return type(name, (), {})
+
+
+class _EmptyPackages(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Finds the unused packages and all their modules."""
+
+    def find_spec(
+        self, name: str, path: Any = None, target: Any = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if name.partition(".")[0] not in _UNUSED:
+            return None
+        return importlib.machinery.ModuleSpec(name, self, is_package=True)
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> types.ModuleType:
+        return _EmptyModule(spec.name)
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        """Nothing is in it."""
+
+
+if _UNUSED:
+    sys.meta_path.insert(0, _EmptyPackages())
