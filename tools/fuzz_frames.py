@@ -36,8 +36,8 @@ from deal_hw.drivers.cartpole.chips import native
 from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.go2.messages.low_command import decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.wire import without_padding
 from deal_hw.drivers.servo_bus import packets
+from deal_hw.drivers.unitree.go_messages.frames import without_padding
 from deal_hw.errors import FrameError, TransportTimeoutError
 
 

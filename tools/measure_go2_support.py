@@ -15,8 +15,9 @@ from measuring import Rows, line, markdown, parser
 from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY, SUPPORT
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import draw_truth
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.support import read_support
 
 SITUATIONS = {

@@ -9,11 +9,12 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.go2.descriptions.driver import SUPPLY
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_simulated
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.unitree.doctor import Received, UnitreeDoctor
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.supply import Supply
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.findings import Finding, Severity

@@ -12,13 +12,13 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER, SUPPLY
 from deal_hw.drivers.go2.descriptions.leg_geometry import SUPPORT
-from deal_hw.drivers.go2.messages.body import body_state
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.go_messages.body import body_state
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.motor_command import MODE_SERVO
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.robot import SUBSCRIBED, UnitreeRobot

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import get_args
 
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.errors import UnknownNameError
 

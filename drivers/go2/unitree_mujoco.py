@@ -28,12 +28,12 @@ from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.descriptions import on_stand
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.messages.simulated import NOTICE, decode_simulated
 from deal_hw.drivers.go2.robot import STOP_BUTTONS, Go2Robot
 from deal_hw.drivers.go2.state_stream import StateStream
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.errors import ConfigurationError, FrameError, WrongDeviceError
 from deal_hw.transport import Message, TopicTransport
 

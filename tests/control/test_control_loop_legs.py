@@ -23,11 +23,12 @@ from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages.low_command import decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.unitree.command_log import DAMPING, STIFF, kind_of
+from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.posture import PostureBehaviour, PostureConfig
 from deal_hw.transport import Message

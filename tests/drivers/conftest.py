@@ -15,8 +15,9 @@ import pytest
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
 from deal_hw.drivers.go2.emulator.truth import nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.rpc import Request, Response, decode_response, encode_request
 from deal_hw.types import FloatArray
 

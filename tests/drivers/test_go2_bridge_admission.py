@@ -17,11 +17,12 @@ from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits, is_damping
 from deal_hw.drivers.go2.bridge.robot_side import ASK_NS, RobotSide
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.wire import low_command_image
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Echo, Stamp
 from deal_hw.drivers.unitree.cdr import words_crc
+from deal_hw.drivers.unitree.go_messages.frames import low_command_image
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.rpc import Request, encode_request
 from deal_hw.drivers.unitree.support import PATIENCE_S
 from deal_hw.drivers.unitree.takeover import LISTEN_S, RELEASE_PAUSE_S

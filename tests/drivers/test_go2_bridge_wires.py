@@ -14,10 +14,10 @@ from deal_hw.drivers.go2.bridge.admission import Control
 from deal_hw.drivers.go2.bridge.bridge import Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.messages.wire import low_command_image
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Echo, read_stamp
 from deal_hw.drivers.unitree.cdr import words_crc
+from deal_hw.drivers.unitree.go_messages.frames import low_command_image
 from deal_hw.drivers.unitree.rpc import STATUS_TEXTS, Request, encode_request, read_note
 from deal_hw.errors import TransportError, TransportLostError
 from deal_hw.transport import Message

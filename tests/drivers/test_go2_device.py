@@ -15,9 +15,9 @@ from deal_hw.drivers.go2.descriptions.on_stand_recording import parameter_space
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
 from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.go2.messages.sport_state import decode_sport_state
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.sim.engine.model import load_model, model_with
 from deal_hw.types import FloatArray
 
@@ -168,8 +168,8 @@ def test_bad_commands_are_not_obeyed(make_go2: Any, what: str) -> None:
 
 
 def _with_nan(payload: bytes) -> bytes:
-    from deal_hw.drivers.go2.messages.wire import low_command_image
     from deal_hw.drivers.unitree.cdr import words_crc
+    from deal_hw.drivers.unitree.go_messages.frames import low_command_image
 
     changed = bytearray(payload)
     changed[28:32] = np.float32(np.nan).tobytes()

@@ -11,8 +11,8 @@ import pytest
 
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, STANDING
 from deal_hw.drivers.go2.messages.low_command import LowCommand, decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.rpc import Response
 from deal_hw.types import FloatArray
 

@@ -17,9 +17,10 @@ from pycdr2.types import array, float32, int16, int32, int64, sequence, uint8, u
 from deal_hw.drivers.go2.descriptions.floor import JOINTS, LEGS
 from deal_hw.drivers.go2.messages import sport_state
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS, WIRE_LEGS
 from deal_hw.drivers.unitree import remote, rpc
+from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.errors import FrameError
 
 # The IDL of unitree_go and unitree_api, field by field. Fields are named as there.

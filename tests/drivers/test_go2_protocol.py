@@ -11,16 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deal_hw.drivers.go2.descriptions import floor
-from deal_hw.drivers.go2.messages.layout import (
+from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
+from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
+from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS
+from deal_hw.drivers.unitree.cdr import words_crc
+from deal_hw.drivers.unitree.go_messages.frames import low_command_image, low_state_image
+from deal_hw.drivers.unitree.go_messages.layout import (
     COMMAND_MODE_AT,
     LOW_COMMAND_BYTES,
     LOW_STATE_BYTES,
     STATE_MODE_AT,
 )
-from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowState, LowStateFrame, decode_low_state, encode_low_state
-from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS, low_command_image, low_state_image
-from deal_hw.drivers.unitree.cdr import words_crc
+from deal_hw.drivers.unitree.go_messages.low_state import LowState, LowStateFrame
 from deal_hw.errors import ConfigurationError, FrameError
 
 

@@ -19,10 +19,11 @@ from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS, LEGS, jo
 from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY, SUPPORT
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import HANGING, draw_truth, nominal_truth
-from deal_hw.drivers.go2.messages.low_state import LowState, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.drivers.unitree.support import Support, read_support
 from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.types import FloatArray

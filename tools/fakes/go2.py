@@ -17,10 +17,11 @@ from deal_hw.clock import VirtualClock
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.leg_geometry import GEOMETRY
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
+from deal_hw.drivers.go2.messages.low_state import encode_low_state
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import TopicCore, VirtualTopics
+from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.drivers.unitree.remote import Remote, encode_remote
 from deal_hw.drivers.unitree.rpc import Request, Response, decode_request, encode_response
 from deal_hw.robot import Robot

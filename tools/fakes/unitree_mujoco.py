@@ -16,11 +16,11 @@ import numpy as np
 
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, EFFORT_LIMIT_NM, JOINTS, LEGS, per_joint
 from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as RECORDED
-from deal_hw.drivers.go2.messages import layout
 from deal_hw.drivers.go2.messages.low_command import LowCommand, decode_low_command
 from deal_hw.drivers.go2.messages.wire import SLOT
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.cdr import CDR_HEADER
+from deal_hw.drivers.unitree.go_messages import layout
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 

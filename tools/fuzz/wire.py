@@ -21,8 +21,8 @@ from deal_hw.drivers.go2.emulator.truth import GO2
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
 from deal_hw.drivers.go2.messages.low_state import decode_low_state, encode_low_state
 from deal_hw.drivers.go2.messages.sport_state import LONG_BYTES, SHORT_BYTES, decode_sport_state
-from deal_hw.drivers.go2.messages.wire import low_command_image, low_state_image
 from deal_hw.drivers.unitree.cdr import CDR_HEADER, words_crc
+from deal_hw.drivers.unitree.go_messages.frames import low_command_image, low_state_image
 from deal_hw.drivers.unitree.remote import (
     REMOTE_BYTES,
     Remote,

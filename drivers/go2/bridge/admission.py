@@ -22,9 +22,9 @@ from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits, is_damping
 from deal_hw.drivers.go2.bridge.robot_side import RobotSide
 from deal_hw.drivers.go2.messages.low_command import LowCommand, decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Echo, read_echo
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.motion_switcher import ROBOT_STATE, SELECT_MODE, SERVICE_SWITCH, SWITCHER
 from deal_hw.drivers.unitree.rpc import Request, decode_request
 from deal_hw.errors import FrameError, SafetyError

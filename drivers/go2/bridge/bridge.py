@@ -17,11 +17,12 @@ from deal_hw.drivers.go2.bridge.config import DESCRIPTION, BridgeConfig
 from deal_hw.drivers.go2.bridge.limits import CommandLimits
 from deal_hw.drivers.go2.bridge.robot_side import BUSY
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.go2.messages.refusals import StateCheck
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.zenoh_stamps import Stamp
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.motion_switcher import BUSY as BUSY_CODE
 from deal_hw.drivers.unitree.motion_switcher import CHECK_MODE, SWITCHER, MotionSwitcher, ServiceClient
 from deal_hw.drivers.unitree.rpc import (

@@ -6,7 +6,7 @@ import numpy as np
 
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.messages.low_command import LowCommand
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.motor_command import MODE_OFF, MODE_SERVO
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray

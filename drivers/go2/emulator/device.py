@@ -17,7 +17,7 @@ from deal_hw.drivers.go2.emulator.sensing import Sensing
 from deal_hw.drivers.go2.emulator.sport_controller import LYING, PERIOD_MS, STANDING, Posture
 from deal_hw.drivers.go2.emulator.sport_service import ServiceServer, SportMode
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder, decode_low_command
-from deal_hw.drivers.go2.messages.low_state import LowState, encode_low_state
+from deal_hw.drivers.go2.messages.low_state import encode_low_state
 from deal_hw.drivers.go2.messages.sport_state import POINTS, SportState, encode_sport_state
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.emulated_device import (
@@ -29,6 +29,7 @@ from deal_hw.drivers.unitree.emulated_device import (
     require_finite,
 )
 from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
+from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.drivers.unitree.remote import Remote, encode_remote, encode_wireless, parse_combination
 from deal_hw.rotations import heading
 from deal_hw.sim.legged.simulation import LeggedSimulation

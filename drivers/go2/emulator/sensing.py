@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 
 from deal_hw.drivers.go2.emulator.motors import Motors
-from deal_hw.drivers.go2.messages.low_state import LowState
 from deal_hw.drivers.unitree.emulated_imu import roll_pitch_yaw, turned
 from deal_hw.drivers.unitree.emulated_quadruped import BatteryFacts, QuadrupedProfile, QuadrupedTruth
+from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.sim.legged.simulation import LeggedSimulation
 from deal_hw.types import FloatArray
 

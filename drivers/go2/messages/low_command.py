@@ -1,114 +1,34 @@
-"""LowCmd: PD targets for the motors."""
+"""LowCmd: PD targets for a Go2's motors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 
-from deal_hw.drivers.go2.descriptions.floor import JOINTS
-from deal_hw.drivers.go2.messages import layout
-from deal_hw.drivers.go2.messages.layout import LOW_COMMAND_BYTES
-from deal_hw.drivers.go2.messages.wire import (
-    HEAD,
-    LEVEL_LOW,
-    SLOT,
-    WIRE_JOINTS,
-    check_frame,
-    low_command_image,
-    verify_crc,
-)
-from deal_hw.drivers.unitree.cdr import CDR_HEADER, CRC_START, words_crc
-from deal_hw.drivers.unitree.motor_command import MODE_SERVO, POSITION_STOP, VELOCITY_STOP
-from deal_hw.errors import FrameError
-from deal_hw.types import FloatArray, IntArray
-
-_LARGEST: Final = 1e30
-"""Bound on the sum of squares of a command's numbers; stop values have 5.5e19."""
+from deal_hw.drivers.go2.messages.wire import SLOT
+from deal_hw.drivers.unitree.go_messages import low_command
+from deal_hw.drivers.unitree.go_messages.layout import SLOTS
+from deal_hw.drivers.unitree.motor_command import MODE_SERVO
+from deal_hw.types import IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class LowCommand:
-    """PD targets for the 12 motors, arrays (12,) in model order.
+class LowCommand(low_command.LowCommand):
+    """PD targets for the 12 motors, arrays (12,) in model order; the motors are on unless told otherwise."""
 
-    Attributes:
-        position: Targets q [rad].
-        velocity: Targets dq [rad/s].
-        stiffness: kp [N·m/rad].
-        damping: kd [N·m·s/rad].
-        effort: Feed-forward tau [N·m].
-        mode: The servo's number (1 on a Go2), 0 off.
-        level: 0xFF: to the motors themselves.
-    """
-
-    position: FloatArray
-    velocity: FloatArray
-    stiffness: FloatArray
-    damping: FloatArray
-    effort: FloatArray
     mode: IntArray = field(default_factory=lambda: np.ones(12, np.int64))
-    level: int = LEVEL_LOW
 
 
-class LowCommandEncoder:
-    """Writes LowCommands into a buffer of its own and returns copies; one for each thread.
+class LowCommandEncoder(low_command.LowCommandEncoder):
+    """Writes LowCmds for 12 motors into a buffer of its own and returns copies; one for each thread.
 
     Args:
         servo: Mode in the slots without a motor, as the vendor's examples fill them.
     """
 
     def __init__(self, servo: int = MODE_SERVO) -> None:
-        self._buffer = bytearray(LOW_COMMAND_BYTES)
-        record = np.frombuffer(self._buffer, layout.LOW_COMMAND)[0]
-        record["encapsulation"] = tuple(CDR_HEADER)
-        record["head"] = tuple(HEAD)
-        motors = record["motor"]
-        motors["q"], motors["dq"] = POSITION_STOP, VELOCITY_STOP
-        # (20, 8) floats, whose rows' first five are q, dq, tau, kp, kd; the rest is reserved and stays 0.
-        rows: np.ndarray[tuple[int, int], np.dtype[np.float32]] = np.ndarray(
-            (layout.SLOTS, 5), "<f4", self._buffer, offset=28, strides=(36, 4)
-        )
-        self._rows = rows[: len(JOINTS)]
-        self._bytes = np.frombuffer(self._buffer, "u1")
-        self._bytes[layout.COMMAND_MODE_AT] = servo
-        self._values = np.empty((5, len(JOINTS)))
-        self._flat = self._values.reshape(-1)
-        self._mode, self._level = b"", -1
-        self._start = CRC_START
-
-    def encode(self, command: LowCommand) -> bytes:
-        """Return the command as CDR with header and checksum, 812 bytes.
-
-        Raises:
-            FrameError: A number is not finite, or implausibly large.
-        """
-        values = self._values
-        values[0], values[1], values[2] = command.position, command.velocity, command.effort
-        values[3], values[4] = command.stiffness, command.damping
-        if not self._flat.dot(self._flat) < _LARGEST:
-            raise FrameError(
-                "a LowCmd's numbers must be finite and of a plausible size; this command is not sent"
-            )
-        self._rows[...] = values.take(_WIRE_ROWS)
-        if (mode := command.mode.tobytes()) != self._mode or command.level != self._level:
-            self._set_modes(command)
-            self._mode, self._level = mode, command.level
-        crc = words_crc(self._buffer[28:808], self._start)
-        self._buffer[808:] = crc.to_bytes(4, "little")
-        return bytes(self._buffer)
-
-    def _set_modes(self, command: LowCommand) -> None:
-        self._bytes[layout.COMMAND_MODE_AT[SLOT]] = command.mode
-        self._buffer[6] = command.level
-        # The struct's first 28 bytes hold no motor's numbers, so their part of the checksum is kept.
-        self._start = words_crc(low_command_image(bytes(self._buffer))[:28])
-
-
-_FIELD_COUNT: Final = 5
-_MODEL_OF_SLOT: Final = np.array([JOINTS.index(joint) for joint in WIRE_JOINTS])
-_WIRE_ROWS: Final = _MODEL_OF_SLOT[:, None] + len(JOINTS) * np.arange(_FIELD_COUNT)[None, :]
-"""Index in a flat (5, 12) array in model order of each number in the wire's rows, (12, 5)."""
+        super().__init__(SLOT, np.full(SLOTS, servo))
 
 
 def decode_low_command(payload: bytes) -> LowCommand:
@@ -117,18 +37,5 @@ def decode_low_command(payload: bytes) -> LowCommand:
     Raises:
         FrameError: Wrong length, header, head, level flag or checksum, or a reserved field that is not 0.
     """
-    check_frame(payload, "LowCmd")
-    record = np.frombuffer(payload, layout.LOW_COMMAND)[0]
-    verify_crc(payload, "LowCmd")
-    if payload[6] != LEVEL_LOW:
-        raise FrameError(
-            f"LowCmd: level_flag is 0x{payload[6]:02X}; commands to the motors have 0x{LEVEL_LOW:02X}"
-        )
-    if payload[7] or record["reserve"] or record["bms_reserve"].any() or record["motor"]["reserve"].any():
-        raise FrameError(
-            "LowCmd: reserved fields are set; the sender uses another version, or another layout"
-        )
-    motors = record["motor"][SLOT]
-    modes = np.frombuffer(payload, "u1")[layout.COMMAND_MODE_AT[SLOT]]
-    q, dq, kp, kd, tau = (motors[name].astype(np.float64) for name in ("q", "dq", "kp", "kd", "tau"))
-    return LowCommand(q, dq, kp, kd, tau, modes.astype(np.int64), payload[6])
+    c = low_command.decode_low_command(payload, SLOT)
+    return LowCommand(c.position, c.velocity, c.stiffness, c.damping, c.effort, c.mode, c.level)

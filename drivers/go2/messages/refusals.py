@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar, Final, Literal
 
-from deal_hw.drivers.go2.messages.layout import LOW_STATE_BYTES
 from deal_hw.drivers.go2.messages.simulated import UNITREE_MUJOCO, is_unitree_mujoco
+from deal_hw.drivers.unitree.go_messages.layout import LOW_STATE_BYTES
 from deal_hw.drivers.unitree.refusals import StateRefusals
 from deal_hw.errors import FrameError
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Final, Literal
 
-from deal_hw.drivers.go2.messages.layout import LOW_STATE_BYTES
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame, decode_low_state
-from deal_hw.drivers.go2.messages.wire import HEAD
+from deal_hw.drivers.go2.messages.low_state import decode_low_state
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.cdr import CDR_HEADER
+from deal_hw.drivers.unitree.go_messages.frames import HEAD
+from deal_hw.drivers.unitree.go_messages.layout import LOW_STATE_BYTES
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.errors import FrameError, VersionMismatchError
 
 Simulator = Literal["none", "unitree_mujoco"]

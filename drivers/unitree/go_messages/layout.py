@@ -1,4 +1,4 @@
-"""Static layouts of the Go2's two low-level messages on the wire: CDR with its 4-byte header.
+"""Static layouts of unitree_go's two low-level messages on the wire: CDR with its 4-byte header.
 
 Every offset is written out, because a wrong one would move a joint. Source: IDL of unitree_sdk2 @ 21d0a3b and
 unitree_ros2 @ eea2719, compared byte for byte with two CDR libraries. The first motor's mode byte follows its
@@ -7,14 +7,16 @@ predecessor without padding, so the other motors' stride of 36 or 48 bytes does 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from deal_hw.drivers.unitree.cdr import packed
+from deal_hw.types import IntArray
 
 SLOTS: Final = 20
-"""Motor slots of the messages; the Go2 uses the first 12."""
+"""Motor slots of the messages; a Go2 uses the first 12, an H1 all but one."""
 LOW_COMMAND_BYTES: Final = 812
 LOW_STATE_BYTES: Final = 1180
 
@@ -107,3 +109,16 @@ LOW_STATE: Final = packed(
 )
 STATE_MODE_AT: Final = np.array([81, *range(128, 128 + 48 * (SLOTS - 1), 48)])
 """Offset of each motor's mode byte in a LowState, (20,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireOrder:
+    """Where a robot's joints and feet are in the messages.
+
+    Attributes:
+        motors: Motor slot of each joint, (J,).
+        feet: Place of each foot's force, (4,).
+    """
+
+    motors: IntArray
+    feet: IntArray

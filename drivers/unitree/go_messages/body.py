@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.drivers.go2.messages.low_state import LowStateFrame
+from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.types import BodyState
 
