@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Final
 
 from deal_hw.description import LegLimits, RobotDescription, SafetyLimits, SensorModel
-from deal_hw.drivers.g1.joints import JOINTS_23, JOINTS_29, part_of
+from deal_hw.drivers.g1.joints import JOINTS_23, JOINTS_29
+from deal_hw.drivers.unitree.humanoid import mirrored_pose, mirrored_ranges, part_of, per_joint
 from deal_hw.drivers.unitree.spaces import each, joint_space
 from deal_hw.parameters import ParameterSpace
 
@@ -119,29 +120,14 @@ HUNG_TILT_RAD: Final = 0.35
 EASE_IN_S: Final = 3.0
 
 
-def per_joint(table: Mapping[str, float], joints: Sequence[str]) -> tuple[float, ...]:
-    """Return a value for each joint from one for each part."""
-    return tuple(table[part_of(joint)] for joint in joints)
-
-
 def joint_ranges(joints: Sequence[str]) -> tuple[tuple[float, float], ...]:
     """Return the mechanical range of each joint [rad]."""
-    found = []
-    for joint in joints:
-        low, high = RANGE_RAD[part_of(joint)]
-        mirrored = joint.startswith("right_") and part_of(joint) in MIRRORED
-        found.append((-high, -low) if mirrored else (low, high))
-    return tuple(found)
+    return mirrored_ranges(RANGE_RAD, MIRRORED, joints)
 
 
 def hung_pose(joints: Sequence[str]) -> tuple[float, ...]:
     """Return the default pose on the crane, (J,) [rad]."""
-    return tuple(
-        -HUNG_RAD[part_of(joint)]
-        if joint.startswith("right_") and part_of(joint) in MIRRORED
-        else HUNG_RAD[part_of(joint)]
-        for joint in joints
-    )
+    return mirrored_pose(HUNG_RAD, MIRRORED, joints)
 
 
 def _leg_limits(joints: Sequence[str]) -> LegLimits:

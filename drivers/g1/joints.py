@@ -56,8 +56,3 @@ ROBOT_OF: Final[Mapping[int, str]] = MappingProxyType(
     {**dict.fromkeys(MACHINES_29, "g1"), **dict.fromkeys(MACHINES_23, "g1_23dof")}
 )
 """mode_machine -> the robot of deal-hw that describes this version."""
-
-
-def part_of(joint: str) -> str:
-    """Return a joint's part without side and ending, such as ``hip_roll``."""
-    return joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")

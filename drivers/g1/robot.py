@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,26 +24,14 @@ from deal_hw.drivers.g1.refusals import G1Refusals
 from deal_hw.drivers.g1.wording import WORDING
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.claim import WireClaim
+from deal_hw.drivers.unitree.crane import STOP_BUTTONS, HungRobot, hung, on_crane
 from deal_hw.drivers.unitree.motor_command import MODE_SERVO
 from deal_hw.drivers.unitree.remote import Remote
-from deal_hw.drivers.unitree.robot import UnitreeRobot
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
-from deal_hw.errors import SafetyError, WrongDeviceError
+from deal_hw.errors import WrongDeviceError
 from deal_hw.transport import TopicTransport
 from deal_hw.types import BodyState, FloatArray
-
-STOP_BUTTONS: Final = "L2+B"
-HUNG: Final = (
-    "the G1 must hang on a crane, with its feet free and nobody in reach of its limbs: at the end of the "
-    "run, and at every stop, its joints are only damped, and on the floor it would fall"
-)
-ON_CRANE: Final = (
-    "note: the G1 stays on its crane: the run moves its limbs in the air and does not walk, and it ends with "
-    "damped joints (kp 0), in which they sink. The robot holds its last command for ever: if both processes "
-    "of deal-hw are killed, or the connection stays lost, only its remote (L2 and R2: damping) or its power "
-    "switch can stop it; keep them in reach"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +71,10 @@ class G1Claim(WireClaim):
     robot: ClassVar[str] = "g1"
 
 
-class G1Robot(UnitreeRobot[G1Frame]):
+class G1Robot(HungRobot[G1Frame]):
     """A Unitree G1 with 29 joints at its motors' own level, hung on a crane.
 
-    No sensor tells whether it hangs, so the operator must confirm it. ``home`` moves nothing: it releases the
-    robot's own controller, and the safety filter then leads the joints from where they hang to the first
-    targets within 3 s.
+    The safety filter leads the joints from where they hang to the first targets within 3 s.
 
     Args:
         transport: Topics of the robot.
@@ -98,12 +84,10 @@ class G1Robot(UnitreeRobot[G1Frame]):
     """
 
     description: ClassVar[RobotDescription] = DESCRIPTION
-    stopped_by: ClassVar[str] = "its own remote (L2 and R2: damping) or its power switch"
     wording: ClassVar[Wording] = WORDING
     types: ClassVar[Mapping[str, str]] = topics.HUMANOID_TYPES
-    condition: ClassVar[str] = HUNG
-    condition_setting: ClassVar[str] = "hung_on_crane"
-    notice: ClassVar[str] = ON_CRANE
+    condition: ClassVar[str] = hung("G1")
+    notice: ClassVar[str] = on_crane("G1")
     info: G1Info | None
 
     def __init__(
@@ -115,11 +99,10 @@ class G1Robot(UnitreeRobot[G1Frame]):
         hung_on_crane: bool = False,
     ) -> None:
         joints = self.description.joint_names
-        self._hung = hung_on_crane
         self._encoder, self._enabled = G1CommandEncoder(joints), np.full(len(joints), MODE_SERVO)
         self._lost = np.zeros(len(joints), dtype=np.int64)
         stream = TickStream("g1", G1StateDecoder(joints).decode, G1Refusals)
-        super().__init__(transport, clock, stop_buttons, stream)
+        super().__init__(transport, clock, stop_buttons, stream, hung_on_crane=hung_on_crane)
 
     def _await_robot(self) -> None:
         super()._await_robot()
@@ -156,17 +139,8 @@ class G1Robot(UnitreeRobot[G1Frame]):
             return None
         return G1Info(self._frame.mode_machine, self._frame.version)
 
-    def _before_release(self) -> None:
-        if not self._hung:
-            raise SafetyError(f"{self.description.name}: {HUNG}. Confirm it by --hung-on-crane")
-
-    def _after_release(self) -> None:
-        if self._frame is not None and (wrong := self._motor_fault(self._frame)):
-            raise SafetyError(wrong)
-
-    def _notice_frame(self, frame: G1Frame) -> None:
-        if self._armed and not self._fault:
-            self._fault = self._motor_fault(frame) or machine_fault(frame.mode_machine, self.description.name)
+    def _frame_fault(self, frame: G1Frame) -> str:
+        return self._motor_fault(frame) or machine_fault(frame.mode_machine, self.description.name)
 
     def _motor_fault(self, frame: G1Frame) -> str:
         """Return what a motor reports that must end the run; "" if nothing."""

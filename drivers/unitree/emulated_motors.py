@@ -11,6 +11,8 @@ from deal_hw.drivers.unitree.motor_command import MODE_SERVO, POSITION_STOP, VEL
 from deal_hw.types import FloatArray, IntArray
 
 AMBIENT_C: Final = 28.0
+ServoModes = Sequence[int | Sequence[int]]
+"""Modes in which motors follow commands: each a number for all of them, or one for each motor, (J,)."""
 _HEAT_K_NM2: Final = 0.25
 _WARMING_S: Final = 150.0
 
@@ -48,13 +50,14 @@ class PdMotors:
         limit: Sequence[float],
         no_load: Sequence[float],
         knee: float,
-        servo_modes: Sequence[int] = (MODE_SERVO,),
+        servo_modes: ServoModes = (MODE_SERVO,),
         heat_k_nm2: float = _HEAT_K_NM2,
     ) -> None:
         count = len(stiffness)
         self._stiffness_factor, self._damping_factor = np.array(stiffness), np.array(damping)
         self._bias, self._limit, self._no_load = np.array(bias), np.array(limit), np.array(no_load)
-        self._knee, self._servo_modes, self._heat_k_nm2 = knee, tuple(servo_modes), heat_k_nm2
+        self._knee, self._heat_k_nm2 = knee, heat_k_nm2
+        self._servo_modes = np.array([np.full(count, mode) for mode in servo_modes])
         self._q, self._dq, self._kp, self._kd, self._tau = np.zeros((5, count))
         self._alive, self._any_dead = np.ones(count), False
         self.mode: IntArray = np.zeros(count, np.int64)
@@ -64,7 +67,7 @@ class PdMotors:
 
     def accept(self, command: MotorCommand) -> None:
         """Hold this command from now on."""
-        on = np.isin(command.mode, self._servo_modes)
+        on = (command.mode == self._servo_modes).any(axis=0)
         # The vendor's stop values switch a loop off at any gain.
         position_on = on & (np.abs(command.position) < POSITION_STOP / 2)
         velocity_on = on & (np.abs(command.velocity) < VELOCITY_STOP)

@@ -20,11 +20,12 @@ from deal_hw.drivers.g1.description import DESCRIPTION, DESCRIPTION_23, SPACES, 
 from deal_hw.drivers.g1.emulator.device import G1Device
 from deal_hw.drivers.g1.emulator.faults import G1FaultPlan
 from deal_hw.drivers.g1.emulator.truth import G1Truth, draw_truth, nominal_truth
-from deal_hw.drivers.g1.joints import JOINTS_29, part_of
+from deal_hw.drivers.g1.joints import JOINTS_29
 from deal_hw.drivers.g1.messages import G1Command, G1CommandEncoder, G1Frame, G1StateDecoder
 from deal_hw.drivers.g1.robot import G1Dof23Robot, G1Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.unitree.humanoid import part_of, per_joint
 from deal_hw.drivers.unitree.rpc import Request, decode_response, encode_request
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.types import FloatArray
@@ -76,7 +77,7 @@ def test_the_model_is_that_of_the_description() -> None:
         np.testing.assert_allclose(model.actuator_gainprm[:, 0], robot.stiffness)
         damping = np.array(robot.damping) + facts.JOINT_DAMPING_NMS_RAD
         np.testing.assert_allclose(-model.actuator_biasprm[:, 2], damping)
-        np.testing.assert_allclose(model.dof_frictionloss, facts.per_joint(facts.FRICTIONLOSS_NM, joints))
+        np.testing.assert_allclose(model.dof_frictionloss, per_joint(facts.FRICTIONLOSS_NM, joints))
         assert float(model.body_mass.sum()) == pytest.approx(mass_kg, abs=1e-3)
 
 

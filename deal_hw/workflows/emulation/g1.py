@@ -37,7 +37,8 @@ def emulate_g1(
 
 
 def _truth(config: EmulateG1Settings) -> G1Truth:
-    from deal_hw.drivers.g1.emulator.truth import DEFAULT_RANGE_RATIO, G1Truth, draw_truth, nominal_truth
+    from deal_hw.drivers.g1.emulator.truth import G1Truth, draw_truth, nominal_truth
+    from deal_hw.drivers.unitree.emulated_humanoid import DEFAULT_RANGE_RATIO
 
     nominal = functools.partial(nominal_truth, robot=config.robot)
     draw = functools.partial(draw_truth, robot=config.robot)

@@ -1,4 +1,4 @@
-"""The emulated G1's own controller and its motion switcher.
+"""An emulated humanoid's own controller and its motion switcher.
 
 Names, numbers and answers of the motion switcher: unitree_sdk2_python @ 37116c5. These facts are not
 published, and are assumed: at power-up the mode "ai" has the robot and holds the joints at 0; its commands
@@ -9,13 +9,13 @@ R2 of the remote).
 from __future__ import annotations
 
 import json
-from typing import Any, Final
+from collections.abc import Callable
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 
-from deal_hw.drivers.g1.messages import G1Command
 from deal_hw.drivers.transports.topics import SERVICES
-from deal_hw.drivers.unitree.motor_command import MODE_SERVO
+from deal_hw.drivers.unitree.motor_command import MotorCommand
 from deal_hw.drivers.unitree.rpc import Request, Response, decode_request, encode_response
 from deal_hw.types import FloatArray
 
@@ -34,8 +34,10 @@ _DAMPING_NMS_RAD: Final = 2.0
 DEBUG_DAMPING_NMS_RAD: Final = 3.0
 SWITCHER: Final = SERVICES[0]
 
+CommandT = TypeVar("CommandT", bound=MotorCommand)
 
-class OwnController:
+
+class OwnController(Generic[CommandT]):
     """The robot's own controller, which holds its joints at 0, and the switcher that releases it.
 
     Attributes:
@@ -45,12 +47,12 @@ class OwnController:
     Args:
         joints: Number of joints.
         name: The mode at power-up; "" for none.
-        mode_machine: Version of the G1, echoed in commands.
+        make: Returns the command that holds positions, (J,), with a kp and a kd for all joints.
     """
 
-    def __init__(self, joints: int, name: str, mode_machine: int) -> None:
+    def __init__(self, joints: int, name: str, make: Callable[[FloatArray, float, float], CommandT]) -> None:
         self.name, self.answered = name, 0
-        self._joints, self._machine = joints, mode_machine
+        self._joints, self._make = joints, make
         self._from, self._begin_ms = np.zeros(joints), -RISE_MS
         self._release_ms: int | None = None
 
@@ -66,14 +68,14 @@ class OwnController:
         self.name, self._release_ms = "", None
         return True
 
-    def command(self, now_ms: int) -> G1Command:
+    def command(self, now_ms: int) -> CommandT:
         """Return its present command."""
         share = min(1.0, (now_ms - self._begin_ms) / RISE_MS)
-        return self._command((1.0 - share) * self._from, _STIFFNESS_NM_RAD, _DAMPING_NMS_RAD)
+        return self._make((1.0 - share) * self._from, _STIFFNESS_NM_RAD, _DAMPING_NMS_RAD)
 
-    def damped(self) -> G1Command:
+    def damped(self) -> CommandT:
         """Return the command of the debug mode: damped joints."""
-        return self._command(np.zeros(self._joints), 0.0, DEBUG_DAMPING_NMS_RAD)
+        return self._make(np.zeros(self._joints), 0.0, DEBUG_DAMPING_NMS_RAD)
 
     def answer(self, service: str, payload: bytes, position: FloatArray, now_ms: int) -> bytes | None:
         """Act on a request and return the response; None if none was requested.
@@ -120,15 +122,3 @@ class OwnController:
         if self.name != name:
             self.select(name, position, now_ms)
         return 0, ""
-
-    def _command(self, position: FloatArray, stiffness: float, damping: float) -> G1Command:
-        zero, ones = np.zeros(self._joints), np.ones(self._joints)
-        return G1Command(
-            position,
-            zero,
-            stiffness * ones,
-            damping * ones,
-            zero,
-            np.full(self._joints, MODE_SERVO),
-            mode_machine=self._machine,
-        )
