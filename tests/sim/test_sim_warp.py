@@ -24,6 +24,7 @@ from deal_hw.sim.engine.batch import ServoBatch, make_engine
 from deal_hw.sim.engine.gpu import EngineName, gpu_problem
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.engine.warp_check import difference_from_mujoco
+from deal_hw.sim.engine.warp_engine import WarpEngine
 from deal_hw.sim.parameters import KIND_TABLE, KINDS, apply_parameters
 from deal_hw.types import FloatArray
 from deal_hw.workflows.robot import described
@@ -77,6 +78,24 @@ def test_rollouts_agree(robot: RobotModel) -> None:
     np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-5)
     np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-4)
     assert np.abs(found[0][0]).max() > 0.05
+
+
+def test_a_shorter_rollout_takes_the_graph_of_a_longer_one(robot: RobotModel) -> None:
+    """And what a new engine finds. Only a longer one captures the step again."""
+    command = 0.1 * np.random.default_rng(3).standard_normal((3, 2, 40, 1))
+    used = members(robot, WARP)
+    assert isinstance(used.engine, WarpEngine)
+    graphs = []
+    for steps in (30, 20, 40, 20):
+        found = used.advance_windows(starts(3, 2), command[:, :, :steps], 10)
+        fresh = members(robot, WARP).advance_windows(starts(3, 2), command[:, :, :steps], 10)
+        np.testing.assert_array_equal(found, fresh)
+        worlds = used.engine._worlds
+        assert worlds is not None
+        # Without a GPU nothing is captured: this stands for it.
+        worlds._graph = worlds._graph or object()
+        graphs.append(worlds._graph)
+    assert graphs[0] is graphs[1] is not graphs[2] is graphs[3]
 
 
 @slow

@@ -2,8 +2,9 @@
 
 Parameters, the constants derived from them and states are those of a `MujocoEngine`: its float64 arrays are
 copied to the device before a rollout. A rollout copies controls there once, and records back once. On a GPU a
-step, with the laws around it, is one captured graph. World ``g N + n`` is member n of N in window g, so model
-fields have N rows: MuJoCo Warp takes the row ``world % N``. Fields that laws write have one row a world.
+step, with the laws around it, is one captured graph, which shorter rollouts take, too. World ``g N + n`` is
+member n of N in window g, so model fields have N rows: MuJoCo Warp takes the row ``world % N``. Fields that
+laws write have one row a world.
 """
 
 from __future__ import annotations
@@ -264,7 +265,8 @@ class _Worlds:
                 "--population or --members, or use --engine mujoco"
             ) from err
         self._nu, self._nv = model.nu, model.nv
-        self._step = wp.zeros(1, dtype=int, device=device)
+        # The step, and the steps of this rollout: on the device, so that a graph holds for any number.
+        self._step = wp.zeros(2, dtype=int, device=device)
         self._control: Any = None
         self._records: dict[str, tuple[int, Any]] = {}
         self._laws: dict[str, list[Any]] = {}
@@ -353,7 +355,7 @@ class _Worlds:
         steps = control.shape[2]
         self._put_control(np.ascontiguousarray(control))
         self._put_records(recorded, steps)
-        self._step.zero_()
+        self._step.assign(np.array([0, steps], dtype=np.int32))
         wp = self._wp
         with wp.ScopedDevice(self._device):
             if laws is not None and laws.loaded:
@@ -381,11 +383,14 @@ class _Worlds:
 
     def _put_control(self, control: FloatArray) -> None:
         # In double precision: to copy twice the bytes takes less than to convert them here.
-        if self._control is None or self._control.shape != control.shape:
-            self._control = self._wp.array(control, dtype=self._wp.float64, device=self._device)
+        rows = control.reshape(-1, control.shape[3])
+        held = self._control
+        if held is None or held.shape[1] != rows.shape[1] or held.shape[0] < len(rows):
+            self._control = self._wp.array(rows, dtype=self._wp.float64, device=self._device)
             self._graph = None
         else:
-            self._control.assign(control)
+            # A shorter rollout takes the first rows: its graph is that of the longest.
+            held[: len(rows)].assign(rows)
 
     def _put_records(self, recorded: Mapping[str, int], steps: int) -> None:
         for name in [*self._records]:
@@ -403,8 +408,9 @@ class _Worlds:
     def _set_control(self) -> None:
         from deal_hw.sim.engine import warp_kernels as kernels
 
-        inputs = [self._step, self._control, self._nu, self._data.ctrl, self._data.qfrc_applied]
-        self._wp.launch(kernels.set_control, dim=(self.count, self._control.shape[3]), inputs=inputs)
+        shape = [self._members, self.count // self._members, self._nu]
+        inputs = [self._step, self._control, *shape, self._data.ctrl, self._data.qfrc_applied]
+        self._wp.launch(kernels.set_control, dim=(self.count, self._control.shape[1]), inputs=inputs)
 
     def _write_efforts(self) -> None:
         from deal_hw.sim.engine import warp_kernels as kernels

@@ -12,15 +12,17 @@ vec10 = wp.types.vector(length=10, dtype=float)
 @wp.kernel
 def set_control(
     step: wp.array[int],
-    control: wp.array4d[wp.float64],
+    control: wp.array2d[wp.float64],
+    members: int,
+    windows: int,
     nu: int,
     ctrl: wp.array2d[float],
     applied: wp.array2d[float],
 ) -> None:
-    """Set controls and applied forces of this step from (N, G, S, nu or nu + nv)."""
+    """Set controls and applied forces of this step from the first N G S rows, (..., nu or nu + nv)."""
     w, i = wp.tid()
-    members = control.shape[0]
-    value = float(control[w % members, w // members, step[0], i])
+    row = ((w % members) * windows + w // members) * step[1] + step[0]
+    value = float(control[row, i])
     if i < nu:
         ctrl[w, i] = value
     else:
