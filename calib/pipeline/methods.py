@@ -141,6 +141,11 @@ def search_of(name: str) -> str:
     return search or pipeline
 
 
+def takes_engine(name: str) -> bool:
+    """Return whether a method has a search whose populations the problem's engine simulates."""
+    return search_of(name) in ENGINE_SEARCHES or name in SEARCHING
+
+
 def check_method(name: str) -> None:
     """Raise `UnknownNameError`, which lists the table, where there is no such method."""
     pipeline, search = divided(name)

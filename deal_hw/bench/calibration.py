@@ -12,7 +12,7 @@ import itertools
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from deal_hw.bench.figures import draw
 from deal_hw.bench.loop import calibration_row
@@ -20,6 +20,9 @@ from deal_hw.bench.rows import Cells, RowTable, noted_in
 from deal_hw.bench.settings import FixedRange, Mismatch
 from deal_hw.bench.tables import line, print_summary
 from deal_hw.bench.tasks import check_tasks, make_case
+
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.gpu import EngineName
 
 PAPER_NOTE = "the truth is the nominal model: its values, kept without any recording, have an error of 0 here"
 KEY = (
@@ -33,6 +36,7 @@ KEY = (
     "refined",
     "range_ratio",
     "seed",
+    "engine",
 )
 """Fields that identify a cell."""
 
@@ -54,6 +58,7 @@ class Cell:
         refined: Whether the refinement follows.
         range_ratio: Ratio of the search range.
         seed: Seed of everything.
+        engine: What simulates the population of a search; "" for mujoco.
     """
 
     protocol: str
@@ -68,6 +73,7 @@ class Cell:
     refined: bool
     range_ratio: float
     seed: int
+    engine: EngineName | Literal[""]
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -100,6 +106,7 @@ def make_cells(settings: FixedRange | Mismatch) -> list[Cell]:
             refined=settings.refine_all or is_default(method),
             range_ratio=range_ratio,
             seed=seed,
+            engine=settings.engine_of(method),
         )
         for task, range_ratio, policy, seed, method in itertools.product(
             settings.task,
@@ -152,6 +159,6 @@ def run_cell(cell: Cell, *, population: int | None, generations: int, threads: i
             checkpoint=cell.policy,
             seconds=cell.demonstration_s,
         )
-        part, _ = calibration_row(case, cell.method, budget, threads)
+        part, _ = calibration_row(case, cell.method, budget, threads, cell.engine or "mujoco")
         row |= part
     return row

@@ -10,7 +10,7 @@ import itertools
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,12 +32,15 @@ from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.shipped import required_policy
 
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.gpu import EngineName
+
 TASK_EPISODES = 5
 KEY = ("profile", "seed", "method", "range_ratio")
 
 
 def calibration_row(
-    case: Case, method: str, budget: Budget, threads: int | None
+    case: Case, method: str, budget: Budget, threads: int | None, engine: EngineName = "mujoco"
 ) -> tuple[dict[str, Any], CalibrationResult]:
     """Calibrate with one method and score it.
 
@@ -57,6 +60,7 @@ def calibration_row(
         rng=np.random.default_rng(d.seed),
         threads=threads,
         policy=d.policy,
+        engine=engine,
     )
     # Play in the gears may have become a parameter.
     found = result.restricted(d.space)

@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -38,7 +38,10 @@ from deal_hw.workflows.calibration.settings import (
 )
 from deal_hw.workflows.say import silent, to_stderr
 
-KEY = ("task", "split", "method", "refined", "range_ratio", "seed")
+if TYPE_CHECKING:
+    from deal_hw.sim.engine.gpu import EngineName
+
+KEY = ("task", "split", "method", "refined", "range_ratio", "seed", "engine")
 UNTOLD = frozenset({"nominal", "output-error", "output-error-no-laws"})
 """Pipelines that need no expected prediction error."""
 
@@ -145,7 +148,8 @@ def table(settings: Real) -> RowTable:
     )
     args = []
     for seed, method in itertools.product(settings.seeds, settings.methods):
-        cell = (method, is_default(method) or settings.refine_all, settings.range_ratio, seed)
+        refined, engine = is_default(method) or settings.refine_all, settings.engine_of(method)
+        cell = (method, refined, settings.range_ratio, seed, engine)
         args.append(((task, split, *cell), cell))
     cells = Cells(names=KEY, run=run, args=args, tasks=settings.tasks(), bench=settings.name)
     return RowTable(cells=cells, line=line, summary=print_real, draw=draw)
@@ -159,6 +163,7 @@ def run_cell(
     refine: bool,
     range_ratio: float,
     seed: int,
+    engine: EngineName | Literal[""] = "",
     *,
     expected: Callable[[str], FloatArray | None],
     budget: Budget,
@@ -175,6 +180,7 @@ def run_cell(
         refine: Whether the refinement follows.
         range_ratio: Ratio of the search range, for the row.
         seed: Seed of everything random.
+        engine: What simulates the population of a search; "" for mujoco.
         expected: Returns a method's expected prediction error, (2 C,); None: the sensor noise, or the
             method's own estimate.
         budget: Limits of the search.
@@ -190,6 +196,7 @@ def run_cell(
         "refined": refine,
         "range_ratio": range_ratio,
         "seed": seed,
+        "engine": engine,
         "error": "",
     }
     with noted_in(row):
@@ -206,6 +213,7 @@ def run_cell(
             known_std=expected(method),
             # An uncalibrated model has no latency.
             latency_s=0.0 if method == "nominal" else None,
+            engine=engine or "mujoco",
         )
         row |= result_part(result, window_s)
     return row

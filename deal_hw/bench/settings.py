@@ -155,6 +155,29 @@ class SpreadBench(SeededBench):
 
 
 @dataclass(frozen=True, kw_only=True)
+class EngineBench(SpreadBench):
+    """A bench whose searches another engine can simulate; `auto` would make rows depend on the machine."""
+
+    engine: EngineName = "mujoco"
+    """What simulates the populations of deal, eki and deal-paper, as for `deal-hw calibrate`: warp on an
+    NVIDIA GPU (docs/how-to/gpu.md). A row names it. Methods without such a search take mujoco."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.ray is not None and self.engine != "mujoco":
+            raise ConfigurationError(
+                f"--ray with --engine {self.engine}: the cells of all workers would share one device; leave "
+                "one of the two out"
+            )
+
+    def engine_of(self, method: str) -> EngineName | Literal[""]:
+        """Return what simulates a method's populations, for its row; "" for mujoco."""
+        from deal_hw.calib.pipeline.methods import takes_engine
+
+        return self.engine if self.engine != "mujoco" and takes_engine(method) else ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SearchingBench(SeededBench):
     """A bench whose methods have one budget."""
 
@@ -185,7 +208,7 @@ class TaskBench(SeededBench):
 
 
 @dataclass(frozen=True, kw_only=True)
-class KnownTruth(TaskBench, SpreadBench):
+class KnownTruth(TaskBench, EngineBench):
     """A bench that calibrates robots whose truth it knows."""
 
     work: ClassVar[str] = "deal_hw.bench.calibration:table"
@@ -355,7 +378,7 @@ class Speed(TaskBench):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Real(SearchingBench, SpreadBench):
+class Real(SearchingBench, EngineBench):
     """Compare methods on recordings of a real robot (--model, --data) by their errors on held-out motion."""
 
     name: ClassVar[str] = "real"

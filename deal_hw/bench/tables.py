@@ -101,9 +101,11 @@ def print_summary(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def method_name(row: Mapping[str, Any]) -> str:
-    """Return a row's method, and whether a refinement followed, if that is a choice."""
+    """Return a row's method, whether a refinement followed, if that is a choice, and another engine."""
     method = str(row["method"])
-    return f"{method} + refinement" if row.get("refined") and not is_default(method) else method
+    refined = " + refinement" if row.get("refined") and not is_default(method) else ""
+    engine = f" on {row['engine']}" if row.get("engine") else ""
+    return f"{method}{refined}{engine}"
 
 
 def _group(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from deal_hw.bench import calibration, tasks
 from deal_hw.bench.rows import write_rows
 from deal_hw.bench.scores import check_truth
 from deal_hw.bench.settings import FixedRange, Loop, Mismatch, Paper
+from deal_hw.bench.tables import method_name
 from deal_hw.bench.tasks import make_case
 from deal_hw.cli.bench import bench
 from deal_hw.drivers.cartpole.description import SPACES
@@ -24,6 +25,7 @@ from deal_hw.drivers.cartpole.emulator.oracle import draw_truth
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine import warp_support
 from deal_hw.workflows.shipped import shipped_policy
 
 FIELDS = {
@@ -182,6 +184,34 @@ def test_a_truth_outside_its_range_is_refused_in_every_calibration_bench(
     monkeypatch.undo()
     row = calibration.run_cell(cell, population=4, generations=1, threads=1)
     assert row["error"] == "" and row["null_error_percent"] < 400
+
+
+def test_methods_with_such_a_search_are_on_the_engine_that_is_named() -> None:
+    """Their rows say so and are cells of their own; a row of mujoco's is that of before."""
+    methods = ("default", "eki", "easi", "midpoint")
+    asked = FixedRange(methods=methods, seeds=(3,), engine="warp")
+    assert [cell.engine for cell in calibration.make_cells(asked)] == ["warp", "warp", "", ""]
+    before = calibration.make_cells(dataclasses.replace(asked, engine="mujoco"))
+    assert {cell.engine for cell in before} == {""}
+    row = {"method": "eki", "refined": True, "engine": "warp"}
+    assert method_name(row) == "eki + refinement on warp"
+
+
+def test_a_row_names_why_its_engine_cannot_simulate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search gets the cell's engine: without a GPU the row has the line with its remedy."""
+    monkeypatch.setattr(warp_support, "check_installed", lambda: None)
+    monkeypatch.setattr(warp_support, "gpu_problem", lambda: "no NVIDIA driver is installed")
+    (cell,) = calibration.make_cells(FixedRange(methods=("eki",), seeds=(3,), engine="warp"))
+    row = calibration.run_cell(cell, population=4, generations=1, threads=1)
+    assert row["engine"] == "warp"
+    assert "--engine warp needs a GPU, and no NVIDIA driver is installed" in row["error"]
+
+
+def test_workers_do_not_share_a_device() -> None:
+    """Each would measure its free memory for itself alone."""
+    with pytest.raises(ConfigurationError, match=r"--ray with --engine warp: .*leave one of the two out"):
+        FixedRange(ray="local", engine="warp")
+    assert FixedRange(ray="local").engine == "mujoco"
 
 
 def test_the_ends_of_a_range_belong_to_it() -> None:

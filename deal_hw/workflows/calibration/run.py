@@ -333,10 +333,9 @@ def calibrate_episodes(
         from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
         from deal_hw.calib.pipeline.methods import (
             CLOSED_LOOP_METHODS,
-            ENGINE_SEARCHES,
-            SEARCHING,
             make_method,
             search_of,
+            takes_engine,
         )
         from deal_hw.calib.validation.metrics import HeldOut
     except ModuleNotFoundError as err:
@@ -362,8 +361,7 @@ def calibrate_episodes(
     if engine != "mujoco":
         from deal_hw.sim.engine.warp_support import choose_engine
 
-        searches = search_of(method) in ENGINE_SEARCHES or method in SEARCHING
-        without = "" if searches else method
+        without = "" if takes_engine(method) else method
         problem.engine = choose_engine(engine, robot, budget.population, "the search", say, without)
     check_delays(problem)
     check_efforts(problem)
