@@ -43,3 +43,10 @@ def facts() -> dict[str, str]:
             digest.update(f"{part}/{place}\n".encode() + file.read_bytes())
     found["deal-hw"], found["sources"] = version, digest.hexdigest()[:12]
     return found
+
+
+def stamped_facts() -> tuple[dict[str, str], float]:
+    """Return the facts, and this machine's clock [s since 1970]."""
+    import time
+
+    return facts(), time.time()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import socket
+import time
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -11,6 +13,9 @@ from deal_hw.scale import facts
 
 ANSWER_S: Final = 120.0
 """Longest wait for a node's answer; a worker's first start loads Ray from the disk [s]."""
+
+CLOCK_S: Final = 5.0
+"""Difference of two machines' clocks that is said [s]."""
 
 
 def check_nodes(threads: int) -> None:
@@ -37,7 +42,7 @@ def check_nodes(threads: int) -> None:
     # As code: on a node without deal-hw the name of a function means nothing.
     cloudpickle.register_pickle_by_value(facts)
     try:
-        ask = ray.remote(num_cpus=0, max_retries=1)(facts.facts)
+        ask, began = ray.remote(num_cpus=0, max_retries=1)(facts.stamped_facts), time.time()
         asked = {
             ask.options(
                 scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
@@ -56,7 +61,7 @@ def check_nodes(threads: int) -> None:
     mine = facts.facts()
     for answer, name in asked.items():
         try:
-            theirs = ray.get(answer)
+            theirs, clock = ray.get(answer)
         except ray.exceptions.RayError as err:
             first = str(err).strip().rpartition("\n")[2]
             raise ClusterError(
@@ -65,6 +70,26 @@ def check_nodes(threads: int) -> None:
             ) from err
         if why := difference(mine, theirs):
             raise ClusterError(f"node {name} {why}")
+        if apart := clocks_apart(clock, began, time.time()):
+            logging.getLogger(__name__).warning("node %s: %s", name, apart)
+
+
+def clocks_apart(clock: float, began: float, ended: float) -> str:
+    """Return how a node's clock differs from this machine's, with the remedy; "" where it does not.
+
+    Args:
+        clock: The node's clock when it answered [s].
+        began: This machine's clock before the question [s].
+        ended: This machine's clock after the answer [s].
+    """
+    ahead = clock - ended if clock > ended else min(clock - began, 0.0)
+    if abs(ahead) <= CLOCK_S:
+        return ""
+    side = "ahead of" if ahead > 0 else "behind"
+    return (
+        f"its clock is {abs(ahead):.0f} s {side} this machine's; results do not depend on it, but dates in "
+        "files and logs do: let both follow NTP (`timedatectl set-ntp true`)"
+    )
 
 
 def difference(mine: Mapping[str, str], theirs: Mapping[str, str]) -> str:
