@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import psutil
@@ -24,7 +25,7 @@ from deal_hw.bench.settings import FixedRange
 from deal_hw.scale.where import task_map
 
 
-def cell(seed: int, method: str = "local") -> tuple[str, float]:
+def cell(seed: int, method: str) -> tuple[str, float]:
     """Calibrate one robot; return the row but for its time, as JSON, and the processor time [s]."""
     began = time.process_time()
     (one,) = make_cells(FixedRange(methods=(method,), seeds=(seed,)))
@@ -45,14 +46,15 @@ def processor_s() -> float:
     return total
 
 
-def measure(workers: int, seeds: Sequence[int]) -> tuple[dict[str, Any], list[str]]:
+def measure(workers: int, seeds: Sequence[int], method: str) -> tuple[dict[str, Any], list[str]]:
     """Do the cells; return the row without its overhead, and the cells' own rows."""
     began = time.perf_counter()
     with task_map(f"local:{workers}" if workers else None) as tasks:
         tasks.map(load, range(2 * workers))
         start_s, spent, began = time.perf_counter() - began, processor_s(), time.perf_counter()
-        found = tasks.map(cell, seeds)
+        found = tasks.map(partial(cell, method=method), seeds)
         row = {
+            "method": method,
             "workers": workers,
             "cells": len(seeds),
             "start_s": start_s,
@@ -68,7 +70,7 @@ def load(seed: int) -> None:
     import deal_hw.calib.pipeline.output_error_fits
     import deal_hw.calib.report.verdict  # noqa: F401
 
-    cell(seed, "midpoint")
+    cell(seed, method="midpoint")
 
 
 def main() -> None:
@@ -78,10 +80,11 @@ def main() -> None:
     options.add_argument(
         "--workers", default="0,1,2", help="numbers of workers; 0, this process, comes first"
     )
+    options.add_argument("--method", default="local", help="method of the cells")
     args = options.parse_args()
     rows, numbers = Rows(__file__, args.out), list[str]()
     for workers in map(int, args.workers.split(",")):
-        row, found = measure(workers, args.seeds)
+        row, found = measure(workers, args.seeds, args.method)
         numbers = numbers or found
         row["equal"] = found == numbers
         row["overhead_percent"] = 100 * (row["cpu_seconds"] / row["cpu_seconds_cells"] - 1)
