@@ -58,7 +58,15 @@ def reachable(address: str) -> None:
         ) from err
 
 
+_SLOW: Final = r"timed out during startup"
+"""What Ray raises where its processes did not start within its 30 s."""
+
 _CAUSES: Final = (
+    (
+        _SLOW,
+        "Ray's processes did not start within its 30 s, three times ({why}); this machine is too busy "
+        "({load}): end other work, or leave out --ray",
+    ),
     (
         r"Version mismatch",
         "the cluster runs another version of Ray or of Python ({why}); install the same ones on all "
@@ -95,17 +103,25 @@ def explained(where: Where) -> Iterator[None]:
     """
     import ray
 
-    try:
-        yield
-    except (
+    kinds = (
         ray.exceptions.RayError,
         RuntimeError,
         ConnectionError,
         ValueError,
         OSError,
         AssertionError,
-    ) as err:
+    )
+    try:
+        yield
+    except Exception as err:
+        if not (isinstance(err, kinds) or too_slow(err)):
+            raise
         raise ClusterError(words(err, where.address)) from err
+
+
+def too_slow(err: Exception) -> bool:
+    """Return whether Ray's processes did not start in time, for which Ray raises a plain `Exception`."""
+    return re.search(_SLOW, str(err)) is not None
 
 
 def words(err: Exception, address: str | None) -> str:
@@ -113,6 +129,7 @@ def words(err: Exception, address: str | None) -> str:
     text = " ".join(f"{type(err).__name__}: {err}".split())
     for pattern, sentence in _CAUSES:
         if re.search(pattern, text):
-            return sentence.format(why=short(text), address=address or "HOST:PORT")
+            load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors"
+            return sentence.format(why=short(text), address=address or "HOST:PORT", load=load)
     place = "on this machine" if address is None else f"with the cluster at {address}"
     return f"Ray cannot start {place}: {short(text)}; its log files are in /tmp/ray/session_latest/logs"

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from typing_extensions import Self
 
 from deal_hw.errors import ClusterError, TaskLostError, short
-from deal_hw.scale.ray_errors import explained, needs_ray, reachable
+from deal_hw.scale.ray_errors import explained, needs_ray, reachable, words
 from deal_hw.scale.ray_nodes import check_nodes
+from deal_hw.scale.ray_start import start_ray
 from deal_hw.task_map import InThisProcess, TaskMap
 
 if TYPE_CHECKING:
@@ -118,13 +119,12 @@ class RayTasks(TaskMap):
                 "include_dashboard": False,
                 "_node_ip_address": "127.0.0.1",
             }
-        with explained(self._where):
-            ray.init(
-                **options,
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-                runtime_env={"env_vars": ONE_THREAD},
-            )
+        options |= {
+            "log_to_driver": False,
+            "logging_level": logging.ERROR,
+            "runtime_env": {"env_vars": ONE_THREAD},
+        }
+        start_ray(self._where, options)
         try:
             if here:
                 _check_loopback(ray.nodes())
@@ -182,18 +182,27 @@ class RayTasks(TaskMap):
 
         try:
             result: R = ray.get(done)
-        except ray.exceptions.RayTaskError as err:
-            raise err.cause from err
         except ray.exceptions.RayError as err:
-            why = TaskLostError(
-                f"the worker of a task ended before the task, {1 + RETRIES} times "
-                f"({short(str(err).partition(chr(10))[0])}); look whether its machine has enough memory, or "
-                "give each task more processors (--threads), so that fewer run at once"
-            )
+            cause = err.cause if isinstance(err, ray.exceptions.RayTaskError) else err
+            if not isinstance(cause, ray.exceptions.RayError):
+                raise cause from err
+            why = TaskLostError(self._why_lost(cause))
             if lost is None:
                 raise why from err
             return lost(spec, why)
         return result
+
+    def _why_lost(self, cause: Exception) -> str:
+        """Return why a task has no result, with the remedy."""
+        import ray
+
+        if isinstance(cause, ray.exceptions.ObjectStoreFullError | ray.exceptions.OutOfDiskError):
+            return words(cause, self._where.address)
+        return (
+            f"the worker of a task ended before the task, {1 + RETRIES} times "
+            f"({short(str(cause).partition(chr(10))[0])}); look whether its machine has enough memory, or "
+            "give each task more processors (--threads), so that fewer run at once"
+        )
 
 
 def _processors() -> int:

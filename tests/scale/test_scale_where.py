@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import re
 import socket
@@ -21,7 +22,8 @@ from deal_hw.errors import ClusterError, ConfigurationError, MissingExtraError, 
 from deal_hw.install import install_line
 from deal_hw.scale import facts, ray_errors
 from deal_hw.scale.ray_errors import reachable, words
-from deal_hw.scale.ray_nodes import difference
+from deal_hw.scale.ray_nodes import clocks_apart, difference
+from deal_hw.scale.ray_start import start_ray
 from deal_hw.scale.where import Where, parse_where, task_map
 from deal_hw.task_map import InThisProcess, TaskMap
 
@@ -137,6 +139,10 @@ def test_auto_without_a_cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             "ray start --address=head:1",
         ),
         ("ObjectStoreFullError: Failed to put object", "--object-store-memory"),
+        (
+            "The current node timed out during startup. This could happen because some of the raylet failed",
+            r"did not start within its 30 s.*too busy .load [\d.]+ on \d+ processors.*leave out --ray",
+        ),
         ("something new", "Ray cannot start with the cluster at head:1: RuntimeError: something new"),
     ],
 )
@@ -144,6 +150,35 @@ def test_errors_of_ray_are_one_line_with_a_remedy(text: str, said: str) -> None:
     """As Ray words them."""
     line = words(RuntimeError(text), "head:1")
     assert re.search(said, line) and "\n" not in line and len(line) < 800
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (extra scale)")
+@pytest.mark.parametrize(
+    ("text", "fail", "begun", "said"),
+    [
+        ("The current node timed out during startup.", 2, 3, ""),
+        ("The current node timed out during startup.", 3, 3, "did not start within its 30 s, three times"),
+        ("Could not find any running Ray instance.", 1, 1, "no Ray cluster runs on this machine"),
+    ],
+)
+def test_a_start_that_was_too_slow_is_begun_again(
+    monkeypatch: pytest.MonkeyPatch, text: str, fail: int, begun: int, said: str
+) -> None:
+    """Three times in all; what another start would not change is said at once."""
+    import ray
+
+    calls: list[dict[str, Any]] = []
+
+    def init(**options: Any) -> None:
+        calls.append(options)
+        if len(calls) <= fail:
+            # Ray raises this very class for a slow start.
+            raise (Exception if "startup" in text else ConnectionError)(text)
+
+    monkeypatch.setattr(ray, "init", init)
+    with pytest.raises(ClusterError, match=said) if said else contextlib.nullcontext():
+        start_ray(Where(), {"num_cpus": 2})
+    assert calls == [{"num_cpus": 2}] * begun
 
 
 def test_a_node_must_compute_as_this_machine_does() -> None:
@@ -159,6 +194,16 @@ def test_a_node_must_compute_as_this_machine_does() -> None:
     )
     assert "other sources of deal-hw" in difference(mine, {**mine, "sources": "0"})
     assert "has numpy none" in difference(mine, {k: v for k, v in mine.items() if k != "numpy"})
+
+
+def test_clocks_that_are_apart_are_said() -> None:
+    """By how much at least: an answer has any time between the question and the end of the wait."""
+    assert clocks_apart(110.0, 100.0, 120.0) == clocks_apart(95.0, 100.0, 120.0) == ""
+    assert clocks_apart(3720.0, 100.0, 120.0).startswith(
+        "its clock is 3600 s ahead of this machine's; results"
+    )
+    assert clocks_apart(40.0, 100.0, 120.0).startswith("its clock is 60 s behind this machine's")
+    assert "timedatectl" in clocks_apart(0.0, 100.0, 120.0)
 
 
 def test_other_sources_have_another_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
