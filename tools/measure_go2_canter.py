@@ -31,8 +31,7 @@ from measuring import Row, Rows, add_seeds, parser
 
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import LEGS
-from deal_hw.drivers.go2.emulator.profiles import PROFILES
-from deal_hw.drivers.go2.emulator.truth import draw_truth
+from deal_hw.drivers.go2.emulator.truth import PROFILES, draw_truth
 from deal_hw.motions.scores.gait import gait_score, stances
 from deal_hw.motions.scores.straightness import LINE_M, straightness
 from deal_hw.motions.scores.velocity_error import velocity_error, wanted_velocity

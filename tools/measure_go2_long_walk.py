@@ -22,7 +22,7 @@ import psutil
 from measuring import head, parser, write_document
 
 from deal_hw.data.recording.repair import verify
-from deal_hw.drivers.go2.emulator.profiles import PROFILES
+from deal_hw.drivers.go2.emulator.truth import PROFILES
 from deal_hw.workflows.deploy import deploy
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.walk_script import PROFILE, PROFILE_S, Script, write_script

@@ -31,8 +31,7 @@ from measuring import head, parser, program, write_document
 from deal_hw.bench.rows import Cells, Row, run_cells
 from deal_hw.control.process.channel import Outcome
 from deal_hw.drivers.go2.descriptions.driver import DRIVER, LEG_LIMITS
-from deal_hw.drivers.go2.emulator.profiles import PROFILES
-from deal_hw.drivers.go2.emulator.truth import draw_truth, nominal_truth
+from deal_hw.drivers.go2.emulator.truth import PROFILES, draw_truth, nominal_truth
 from deal_hw.motions.planned_end import PlannedEnd
 from deal_hw.motions.posture import PostureConfig
 from deal_hw.motions.scores.velocity_error import velocity_error

@@ -14,9 +14,8 @@ from deal_hw.drivers.go2.descriptions.floor import JOINTS
 from deal_hw.drivers.go2.descriptions.on_stand_recording import biased_space
 from deal_hw.drivers.go2.emulator.faults import FaultPlan
 from deal_hw.drivers.go2.emulator.motors import Motors
-from deal_hw.drivers.go2.emulator.profiles import PROFILES
 from deal_hw.drivers.go2.emulator.remote_script import RemoteMoment, read_remote_script
-from deal_hw.drivers.go2.emulator.truth import Go2Truth, draw_truth, nominal_truth
+from deal_hw.drivers.go2.emulator.truth import PROFILES, Go2Truth, draw_truth, nominal_truth
 from deal_hw.drivers.go2.messages.low_command import LowCommand
 from deal_hw.drivers.unitree.command_log import kind_of
 from deal_hw.drivers.unitree.emulated_faults import SHARES, StateFaults

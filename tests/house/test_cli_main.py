@@ -400,6 +400,7 @@ def test_start_loads_nothing_heavy(arguments: list[str]) -> None:
     assert sorted(loaded) == [
         "deal_hw.cli",
         "deal_hw.cli.main",
+        "deal_hw.cli.verbs",
         "deal_hw.documentation",
         "deal_hw.errors",
         "deal_hw.install",

@@ -19,10 +19,11 @@ from deal_hw.drivers.go2.descriptions.floor import (
     per_joint,
 )
 from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION as RECORDED
-from deal_hw.drivers.go2.emulator.profiles import PROFILES
+from deal_hw.drivers.unitree.emulated_profile import REALISTIC, SENSOR
 from deal_hw.drivers.unitree.emulated_quadruped import (
     BatteryFacts,
     EmulatedQuadruped,
+    QuadrupedProfile,
     QuadrupedTruth,
     SportGains,
 )
@@ -32,6 +33,17 @@ JOINT_DAMPING_NMS_RAD: Final = 0.6
 ARMATURE_KGM2: Final = 0.01
 HANGING: Final = (0.0, 0.34, -0.85) * len(LEGS)
 """Pose of limp legs in the air, without the hips: the calf's weight opens the knee to its stop."""
+
+_FLOOR: Final = (FLOOR_FRICTION, FLOOR_FRICTION)
+PROFILES: Final = {
+    "ideal": QuadrupedProfile(name="ideal", floor_friction=_FLOOR),
+    "sensor": QuadrupedProfile(name="sensor", floor_friction=_FLOOR, **SENSOR),
+    "realistic": QuadrupedProfile(
+        name="realistic", payload_kg=(0.0, 2.0), floor_friction=(0.5, 1.1), **REALISTIC
+    ),
+}
+"""Differences from ideal mechanics and sensors, in three steps of realism. We know of no published figures of
+a real Go2's sensors: these are assumptions."""
 
 GO2: Final = EmulatedQuadruped(
     robot="go2",
