@@ -2,7 +2,7 @@
 
 Ray's node waits 15 s for its agent, a Python process (`WaitForPersistedPort` of Ray 2.60: "Timed out waiting
 for file .../metrics_agent_port"), and no setting changes that. Where the agent needs longer, the node ends
-itself, and `ray.init` raises after 30 s. The files are in memory then, so the next start is faster.
+itself, and `ray.init` raises after 30 s. Often the next start is faster, since the files are in memory.
 """
 
 from __future__ import annotations
