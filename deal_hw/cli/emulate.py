@@ -8,12 +8,14 @@ from deal_hw.workflows.emulation.cartpole import emulate_cartpole
 from deal_hw.workflows.emulation.common import signalled
 from deal_hw.workflows.emulation.g1 import emulate_g1
 from deal_hw.workflows.emulation.go2 import emulate_go2
+from deal_hw.workflows.emulation.h1 import emulate_h1
 from deal_hw.workflows.emulation.plug_in import emulate_plug_in
 from deal_hw.workflows.emulation.settings import (
     EMULATE,
     EmulateCartpoleSettings,
     EmulateG1Settings,
     EmulateGo2Settings,
+    EmulateH1Settings,
     EmulatePlugInSettings,
     EmulateSettings,
 )
@@ -33,6 +35,8 @@ def emulate(config: EmulateSettings) -> int:
             emulate_go2(config, stop, cut, announce=announce, say=to_stderr)
         elif isinstance(config, EmulateG1Settings):
             emulate_g1(config, stop, cut, announce=announce, say=to_stderr)
+        elif isinstance(config, EmulateH1Settings):
+            emulate_h1(config, stop, cut, announce=announce, say=to_stderr)
         elif isinstance(config, EmulateCartpoleSettings):
             emulate_cartpole(config, stop, cut, announce=announce, say=to_stderr)
         elif isinstance(config, EmulatePlugInSettings):

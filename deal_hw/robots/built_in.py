@@ -70,6 +70,7 @@ def _unitree_wires(claim: str, doctor: str, *, emulated: bool = True) -> tuple[W
 
 _OF_GO2: Final = "deal_hw.drivers.unitree.claim:WireClaim", "deal_hw.drivers.go2.doctor:Go2Doctor"
 _OF_B2: Final = "deal_hw.drivers.b2.robot:B2Claim", "deal_hw.drivers.b2.doctor:B2Doctor"
+_OF_H1: Final = "deal_hw.drivers.h1.robot:H1Claim", "deal_hw.drivers.h1.doctor:H1Doctor"
 _OF_G1: Final = "deal_hw.drivers.g1.robot:G1Claim", "deal_hw.drivers.g1.doctor:G1Doctor"
 
 CARTPOLE: Final = RobotEntry(
@@ -188,6 +189,15 @@ G1_23DOF: Final = RobotEntry(
     machine="g1",
     motors="deal_hw.drivers.g1.joints:JOINTS_23",
 )
+H1: Final = RobotEntry(
+    name="h1",
+    api_version=API_VERSION,
+    driver="deal_hw.drivers.h1.robot:H1Robot",
+    wires=_unitree_wires(*_OF_H1),
+    recorded="deal_hw.drivers.h1.description:DESCRIPTION",
+    spaces="deal_hw.drivers.h1.description:SPACES",
+    motors="deal_hw.drivers.h1.joints:MOTORS",
+)
 ALLEGRO: Final = RobotEntry(
     name="allegro",
     api_version=API_VERSION,
@@ -249,6 +259,7 @@ ROBOTS: Final = (
     B2_ON_STAND,
     G1,
     G1_23DOF,
+    H1,
     SO101,
     ALLEGRO,
     ANT,

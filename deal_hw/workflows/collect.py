@@ -20,6 +20,7 @@ from deal_hw.workflows.running.settings import (
     CartpoleRunOptions,
     G1RunOptions,
     Go2RunOptions,
+    H1RunOptions,
     LegOptions,
     RecordOptions,
     RunOptions,
@@ -115,6 +116,14 @@ class CollectG1Settings(G1RunOptions, CollectSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CollectH1Settings(H1RunOptions, CollectSettings):
+    """Record an H1 that hangs on a crane during an informative motion."""
+
+    seconds: RunSeconds = 10.0
+    """Length of an episode; the first 3 s lead into the motion [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CollectSimulatedSettings(MotionOptions):
     """Record your own robot in simulation, during an informative motion."""
 
@@ -135,6 +144,7 @@ COLLECT = robot_kinds(
         "go2": CollectGo2Settings,
         "b2": CollectB2Settings,
         "g1": CollectG1Settings,
+        "h1": CollectH1Settings,
     },
     plain=CollectSettings,
     legged=CollectLeggedSettings,

@@ -16,6 +16,7 @@ from deal_hw.workflows.running.settings import (
     CartpoleRunOptions,
     G1RunOptions,
     Go2RunOptions,
+    H1RunOptions,
     LegOptions,
     RunOptions,
     crane_of,
@@ -107,12 +108,21 @@ class DeployG1Settings(G1RunOptions, DeploySettings):
     """
 
 
+@dataclass(frozen=True, kw_only=True)
+class DeployH1Settings(H1RunOptions, DeploySettings):
+    """Run a policy on an H1 that hangs on a crane behind the safety filter, and record it.
+
+    It moves the limbs in the air. Walking is not supported: the robot stays on the crane to the end.
+    """
+
+
 DEPLOY = robot_kinds(
     {
         "cartpole": DeployCartpoleSettings,
         "go2": DeployGo2Settings,
         "b2": DeployB2Settings,
         "g1": DeployG1Settings,
+        "h1": DeployH1Settings,
         "so101": DeploySo101Settings,
     },
     plain=DeploySettings,

@@ -26,6 +26,7 @@ from deal_hw.workflows.running.settings import (
     CartpoleRunOptions,
     G1RunOptions,
     Go2RunOptions,
+    H1RunOptions,
     RecordOptions,
     RunOptions,
     SimulationOptions,
@@ -92,6 +93,11 @@ class ReplayG1Settings(G1RunOptions, ReplaySettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplayH1Settings(H1RunOptions, ReplaySettings):
+    """Send a recording's commands to an H1 that hangs on a crane again, and record what happens."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReplaySimulatedSettings(ReplayOptions):
     """Send a recording's commands to your own robot in simulation, and record what happens."""
 
@@ -105,6 +111,7 @@ _ROBOTS = robot_kinds(
         "go2": ReplayGo2Settings,
         "b2": ReplayB2Settings,
         "g1": ReplayG1Settings,
+        "h1": ReplayH1Settings,
     },
     plain=ReplaySettings,
     legged=ReplayLeggedSettings,

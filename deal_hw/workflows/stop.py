@@ -23,7 +23,7 @@ from deal_hw.workflows.options import FROM_PYTHON, from_settings, given, refuse
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.running.commander import who
 from deal_hw.workflows.say import Say, silent
-from deal_hw.workflows.unitree import Go2Link, QuadrupedLink, UnitreeLink
+from deal_hw.workflows.unitree import Go2Link, UnitreeGoLink, UnitreeLink
 
 OBEY_S = 5.0
 """How long a run may take after a request to end until its robot is passive [s]. It takes 0.25 s at most
@@ -97,7 +97,7 @@ class StopGo2Settings(Go2Link, StopSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class StopB2Settings(QuadrupedLink, StopSettings):
+class StopB2Settings(UnitreeGoLink, StopSettings):
     """Make a B2 passive at once, from any terminal: damping. Nothing is asked.
 
     A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
@@ -116,8 +116,24 @@ class StopG1Settings(UnitreeLink, StopSettings):
     """
 
 
+@dataclass(frozen=True, kw_only=True)
+class StopH1Settings(UnitreeGoLink, StopSettings):
+    """Make an H1 passive at once, from any terminal: damping. Nothing is asked. On the floor it falls.
+
+    A run on this computer is told to end and makes its robot passive itself. Without a run, give --port: this
+    program then does it. It sends nothing while another program or the robot's own controller has the robot.
+    The exit code is 0 only if the robot confirmed that it is passive.
+    """
+
+
 STOP = robot_kinds(
-    {"cartpole": StopCartpoleSettings, "go2": StopGo2Settings, "b2": StopB2Settings, "g1": StopG1Settings},
+    {
+        "cartpole": StopCartpoleSettings,
+        "go2": StopGo2Settings,
+        "b2": StopB2Settings,
+        "g1": StopG1Settings,
+        "h1": StopH1Settings,
+    },
     plain=StopSettings,
     legged=StopSettings,
     example="--port {port}",

@@ -24,8 +24,8 @@ class UnitreeLink:
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadrupedLink(UnitreeLink):
-    """The connection to a Go2 or a B2."""
+class UnitreeGoLink(UnitreeLink):
+    """The connection to a robot with the messages unitree_go: a Go2, a B2 or an H1."""
 
     state_check: Literal["strict", "length"] = "strict"
     """How to check the state messages: strict (length, head and checksum), or length alone, for firmware or
@@ -37,7 +37,7 @@ class QuadrupedLink(UnitreeLink):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Go2Link(QuadrupedLink):
+class Go2Link(UnitreeGoLink):
     """The connection to a Go2."""
 
     wire: WireOptions = field(default_factory=WireOptions)

@@ -13,6 +13,7 @@ from deal_hw.drivers.g1.messages import G1Frame, G1StateDecoder
 from deal_hw.drivers.g1.refusals import G1Refusals
 from deal_hw.drivers.g1.wording import WORDING
 from deal_hw.drivers.transports import topics
+from deal_hw.drivers.unitree.crane import CONTROLLER, LEVEL, RELEASED
 from deal_hw.drivers.unitree.doctor import UnitreeDoctor
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.findings import Finding, Severity
@@ -33,12 +34,9 @@ class G1Doctor(UnitreeDoctor[G1Frame]):
     wording: ClassVar[Wording] = WORDING
     kind: ClassVar[str] = "G1"
     types: ClassVar[Mapping[str, str]] = topics.HUMANOID_TYPES
-    controller: ClassVar[str] = "own controller"
-    released: ClassVar[str] = (
-        "hang the robot on a crane first: deal-hw releases this controller when it arms, and a robot that is "
-        "released while it stands falls"
-    )
-    level: ClassVar[str] = "let the crane hold it level"
+    controller: ClassVar[str] = CONTROLLER
+    released: ClassVar[str] = RELEASED
+    level: ClassVar[str] = LEVEL
 
     def __init__(self, link: TopicTransport, clock: Clock, seconds: float) -> None:
         super().__init__(link, clock, seconds)

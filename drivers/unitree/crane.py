@@ -13,6 +13,12 @@ from deal_hw.errors import SafetyError
 from deal_hw.transport import TopicTransport
 
 STOP_BUTTONS: Final = "L2+B"
+CONTROLLER: Final = "own controller"
+RELEASED: Final = (
+    "hang the robot on a crane first: deal-hw releases this controller when it arms, and a robot that is "
+    "released while it stands falls"
+)
+LEVEL: Final = "let the crane hold it level"
 F = TypeVar("F", bound=StateFrame)
 
 

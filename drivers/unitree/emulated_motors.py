@@ -13,7 +13,7 @@ from deal_hw.types import FloatArray, IntArray
 AMBIENT_C: Final = 28.0
 ServoModes = Sequence[int | Sequence[int]]
 """Modes in which motors follow commands: each a number for all of them, or one for each motor, (J,)."""
-_HEAT_K_NM2: Final = 0.25
+HEAT_K_NM2: Final = 0.25
 _WARMING_S: Final = 150.0
 
 
@@ -51,7 +51,7 @@ class PdMotors:
         no_load: Sequence[float],
         knee: float,
         servo_modes: ServoModes = (MODE_SERVO,),
-        heat_k_nm2: float = _HEAT_K_NM2,
+        heat_k_nm2: float = HEAT_K_NM2,
     ) -> None:
         count = len(stiffness)
         self._stiffness_factor, self._damping_factor = np.array(stiffness), np.array(damping)

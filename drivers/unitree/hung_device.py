@@ -20,7 +20,7 @@ from deal_hw.drivers.unitree.emulated_device import (
 from deal_hw.drivers.unitree.emulated_faults import WirePlan
 from deal_hw.drivers.unitree.emulated_humanoid import HumanoidTruth, profile
 from deal_hw.drivers.unitree.emulated_imu import roll_pitch_yaw, turned
-from deal_hw.drivers.unitree.emulated_motors import PdMotors, ServoModes
+from deal_hw.drivers.unitree.emulated_motors import HEAT_K_NM2, PdMotors, ServoModes
 from deal_hw.drivers.unitree.motor_command import MotorCommand
 from deal_hw.drivers.unitree.own_controller import PERIOD_MS, OwnController
 from deal_hw.drivers.unitree.remote import Remote, parse_combination
@@ -73,6 +73,7 @@ class HungDevice(UnitreeDevice[CommandT]):
         plan: Faults to make.
         no_load: Speed of each motor without load in the profile realistic, (J,) [rad/s].
         servo_modes: Modes in which the motors follow commands.
+        heat_k_nm2: Final warming of a motor for the square of its torque [K/(N·m)²].
         controller: Mode of the robot's own controller at power-up; "" for none.
         remote: Whether a remote is in reach.
         tick_ms: The robot's clock at the beginning.
@@ -88,6 +89,7 @@ class HungDevice(UnitreeDevice[CommandT]):
         *,
         no_load: tuple[float, ...],
         servo_modes: ServoModes,
+        heat_k_nm2: float = HEAT_K_NM2,
         controller: str,
         remote: bool,
         tick_ms: int,
@@ -115,6 +117,7 @@ class HungDevice(UnitreeDevice[CommandT]):
             no_load,
             p.knee,
             servo_modes,
+            heat_k_nm2,
         )
         self._noise = np.repeat(
             (p.position_noise, p.velocity_noise, p.acceleration_noise, p.effort_noise), count

@@ -35,21 +35,25 @@ LINES = (
     f"collect go2_on_stand {ZENOH} --out o",
     "collect b2 --port lo --out o --motion hold",
     "collect g1 --port lo --out o --motion hold",
+    "collect h1 --port lo --out o --motion hold",
     "deploy cartpole --port p",
     "deploy cartpole --port p --out o --dry-run",
     "deploy go2 --port lo",
     "deploy b2 --port lo --policy walk.onnx",
     f"deploy g1_23dof {ZENOH} --policy walk.onnx",
+    f"deploy h1 {ZENOH} --policy walk.onnx",
     f"deploy go2 {ZENOH} --no-record",
     "replay e --port p",
     "replay e --port lo --robot go2",
     "replay e --port lo --robot g1 --hung-on-crane",
+    "replay e --port lo --robot h1 --hung-on-crane",
     f"replay e {ZENOH} --robot go2 --stand False",
     "doctor",
     "doctor cartpole --port p",
     "doctor go2 --port lo",
     "doctor b2 --port lo",
     "doctor g1 --port lo",
+    "doctor h1 --port lo",
     f"doctor go2 {ZENOH} --simulator unitree_mujoco",
 )
 VALUES: dict[str, tuple[str, ...]] = {
@@ -168,6 +172,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr("deal_hw.drivers.go2.doctor.Go2Doctor", Listener)
     monkeypatch.setattr("deal_hw.drivers.b2.doctor.B2Doctor", Listener)
     monkeypatch.setattr("deal_hw.drivers.g1.doctor.G1Doctor", Listener)
+    monkeypatch.setattr("deal_hw.drivers.h1.doctor.H1Doctor", Listener)
     return did
 
 

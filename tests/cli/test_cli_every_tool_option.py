@@ -64,6 +64,7 @@ LINES = (
     "emulate go2 --transport zenoh --port tcp/127.0.0.1:7447",
     "emulate b2",
     "emulate g1",
+    "emulate h1",
     "emulate g1 --transport zenoh --port tcp/127.0.0.1:7447",
     "bridge go2 --port lo",
     "bridge go2 --port lo --listen tls/127.0.0.1:7447"
@@ -349,6 +350,7 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     from deal_hw.drivers.cartpole.plant.truth import nominal_truth as nominal_cartpole
     from deal_hw.drivers.g1.emulator.truth import nominal_truth as nominal_g1
     from deal_hw.drivers.go2.emulator.truth import Go2Truth
+    from deal_hw.drivers.h1.emulator import H1Truth
 
     for target, truth in (
         ("cartpole.emulator.oracle", nominal_cartpole),
@@ -356,11 +358,12 @@ def done(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     ):
         drawn = note("drawn", truth("sensor", 0))
         monkeypatch.setattr(f"deal_hw.drivers.{target}.draw_truth", drawn)
-    for quadruped in (Go2Truth, B2Truth):
-        monkeypatch.setattr(quadruped, "draw", note("drawn", quadruped.nominal("sensor", 0)))
+    for kind in (Go2Truth, B2Truth, H1Truth):
+        monkeypatch.setattr(kind, "draw", note("drawn", kind.nominal("sensor", 0)))
     device = types.SimpleNamespace(log=types.SimpleNamespace(requests=[], changes=[]))
     monkeypatch.setattr("deal_hw.drivers.go2.emulator.device.Go2Device", note("device", device))
     monkeypatch.setattr("deal_hw.drivers.g1.emulator.device.G1Device", note("device", device))
+    monkeypatch.setattr("deal_hw.drivers.h1.emulator.H1Device", note("device", device))
     monkeypatch.setattr("deal_hw.drivers.unitree.emulator.UnitreeEmulator", note("go2", emulator))
     monkeypatch.setattr(emulated_topics, "make_topic_transport", note("transport"))
     monkeypatch.setattr(emulated_topics, "summary", lambda report: [])

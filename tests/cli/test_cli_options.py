@@ -217,7 +217,7 @@ def test_a_refused_number_gets_one_line(line: str, words: str, capsys: pytest.Ca
         (
             "collect",
             "`deal-hw collect`: name the robot: cartpole, go2, go2_on_stand, b2, b2_on_stand, g1, "
-            "g1_23dof, so101, robot.yaml, robot.yaml --simulated; example:",
+            "g1_23dof, h1, so101, robot.yaml, robot.yaml --simulated; example:",
         ),
         ("collect cartpole", "`deal-hw collect cartpole` needs --port; --port is: The robot's port"),
         (

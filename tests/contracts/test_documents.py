@@ -23,6 +23,7 @@ from deal_hw.drivers.g1.emulator.truth import G1Truth
 from deal_hw.drivers.g1.emulator.truth import draw_truth as draw_g1
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.emulator.truth import draw_truth as draw_go2
+from deal_hw.drivers.h1.emulator import H1Truth
 from deal_hw.errors import ConfigurationError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterDistribution, ParameterSpace
@@ -85,6 +86,10 @@ DOCUMENTS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "truth of a B2": (
         B2Truth.draw("realistic", 5).to_json(),
         lambda values: B2Truth.from_json(values).to_json(),
+    ),
+    "truth of an H1": (
+        H1Truth.draw("realistic", 5).to_json(),
+        lambda values: H1Truth.from_json(values).to_json(),
     ),
     "truth of a G1": (
         draw_g1("realistic", 5).to_json(),

@@ -47,6 +47,8 @@ SIZES = {
     ("g1", "biased"): 145,
     ("g1_23dof", "default"): 92,
     ("g1_23dof", "biased"): 115,
+    ("h1", "default"): 76,
+    ("h1", "biased"): 95,
     ("go2", "default"): 24,
     ("go2", "paper"): 24,
     ("go2", "walk"): 29,
@@ -333,7 +335,7 @@ def test_robot_without_driver_says_so_and_lists_those_with_one() -> None:
             make_robot(name, "serial", "x", MonotonicClock())
     with pytest.raises(
         UnknownNameError,
-        match=r"cartpole, go2, go2_on_stand, b2, b2_on_stand, g1, g1_23dof, so101, allegro, ant",
+        match=r"cartpole, go2, go2_on_stand, b2, b2_on_stand, g1, g1_23dof, h1, so101, allegro, ant",
     ):
         robot_description("gotwo")
     with pytest.raises(UnknownNameError, match="go2_suspended"):

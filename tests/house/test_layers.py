@@ -76,7 +76,7 @@ ROOMS = {
         {"command_echo", "servo_bus", "topic_robot", "transports"},
         {"unitree"},
         {"cartpole", "g1", "go2", "ros2", "servo_arm"},
-        {"b2", "so101"},
+        {"b2", "h1", "so101"},
     ),
     "drivers.cartpole": (
         {"description"},

@@ -30,7 +30,7 @@ from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.options import from_settings, given, refuse
 from deal_hw.workflows.robot_kinds import robot_kinds
 from deal_hw.workflows.say import html_table
-from deal_hw.workflows.unitree import Go2Link, QuadrupedLink, UnitreeLink
+from deal_hw.workflows.unitree import Go2Link, UnitreeGoLink, UnitreeLink
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class DoctorG1Settings(DoctorUnitreeSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DoctorB2Settings(QuadrupedLink, DoctorUnitreeSettings):
+class DoctorB2Settings(UnitreeGoLink, DoctorUnitreeSettings):
     """Check this computer, the connection and a B2; sends no command to a motor.
 
     The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
@@ -115,12 +115,21 @@ class DoctorGo2Settings(Go2Link, DoctorUnitreeSettings):
             refuse(given(self, DoctorGo2Settings, ("state_check",)), f"{self.simulator} has no checksums")
 
 
+@dataclass(frozen=True, kw_only=True)
+class DoctorH1Settings(UnitreeGoLink, DoctorUnitreeSettings):
+    """Check this computer, the connection and an H1; sends no command to a motor.
+
+    The exit code is 1 if a check failed (FAIL), and 0 with notes and warnings only.
+    """
+
+
 DOCTOR = robot_kinds(
     {
         "cartpole": DoctorCartpoleSettings,
         "go2": DoctorGo2Settings,
         "b2": DoctorB2Settings,
         "g1": DoctorG1Settings,
+        "h1": DoctorH1Settings,
     },
     plain=DoctorRobotSettings,
     legged=DoctorRobotSettings,

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.g1.emulator.faults import G1Faults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
+from deal_hw.drivers.h1.faults import H1Faults
 from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
@@ -103,7 +104,7 @@ class EmulateSettings(Checked):
 
     range_ratio: Annotated[float | None, Ratio] = None
     """Hidden parameters lie within this factor of the nominal ones; by default 5 for the cart-pole, 2 for the
-    Go2 and the B2, 1.5 for the G1 and an arm."""
+    Go2 and the B2, 1.5 for the G1, the H1 and an arm."""
 
     nominal: bool = False
     """Use the nominal parameters and no latency instead of hidden ones."""
@@ -309,11 +310,47 @@ class EmulateG1Settings(EmulateSettings):
     """How it joins its network."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class H1Options(Checked):
+    """Options of ``emulate h1`` alone."""
+
+    controller: Literal["ai", "normal", "advanced", "off"] = "ai"
+    """Mode of the robot's own controller at power-up. It overrides other commands until it is released."""
+
+    no_remote: bool = False
+    """Emulate no remote: its 40 bytes are zeros."""
+
+    tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
+    """The robot's clock at the start [ms]; it wraps at 2**32."""
+
+    faults: H1Faults = field(default_factory=H1Faults)
+    """Faults of the H1. Their times count from the first stiff command."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateH1Settings(EmulateSettings):
+    """Emulate an H1 that hangs on a crane, in real time on its own network, with hidden physics."""
+
+    transport: Literal["dds", "zenoh"] = "dds"
+    """The wire."""
+
+    port: str | None = None
+    """Network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one). By
+    default reachable on this machine only."""
+
+    h1: H1Options = field(default_factory=H1Options)
+    """Options of the H1 alone."""
+
+    wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
+    """How it joins its network."""
+
+
 _SETTINGS: dict[str, type[EmulateSettings]] = {
     "cartpole": EmulateCartpoleSettings,
     "go2": EmulateGo2Settings,
     "b2": EmulateB2Settings,
     "g1": EmulateG1Settings,
+    "h1": EmulateH1Settings,
     "so101": EmulateArmSettings,
 }
 

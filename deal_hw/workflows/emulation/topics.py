@@ -17,7 +17,12 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.robots import robot_entry
 from deal_hw.robots.connect import make_topic_transport
 from deal_hw.workflows.emulation.common import happenings, next_line, realtime_priority, reveal, run_until
-from deal_hw.workflows.emulation.settings import EmulateG1Settings, EmulateGo2Settings, EmulateSettings
+from deal_hw.workflows.emulation.settings import (
+    EmulateG1Settings,
+    EmulateGo2Settings,
+    EmulateH1Settings,
+    EmulateSettings,
+)
 from deal_hw.workflows.say import Say, silent
 
 D = TypeVar("D", bound=DeviceOnTopics)
@@ -25,7 +30,7 @@ _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
 
 
 def emulate_on_topics(
-    config: EmulateGo2Settings | EmulateG1Settings,
+    config: EmulateGo2Settings | EmulateG1Settings | EmulateH1Settings,
     make: Callable[[], D],
     what: str,
     stop: threading.Event,

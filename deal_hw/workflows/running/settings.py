@@ -14,7 +14,7 @@ from deal_hw.robots import default_transport, driver_description, no_driver
 from deal_hw.workflows.options import FROM_PYTHON, File, Ratio, Seed, given, refuse
 from deal_hw.workflows.robot import named
 from deal_hw.workflows.say import Say, silent
-from deal_hw.workflows.unitree import Go2Link, QuadrupedLink, UnitreeLink
+from deal_hw.workflows.unitree import Go2Link, UnitreeGoLink, UnitreeLink
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class UnitreeLinkOptions(UnitreeLink, LinkOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class B2LinkOptions(QuadrupedLink, UnitreeLinkOptions):
+class B2LinkOptions(UnitreeGoLink, UnitreeLinkOptions):
     """The connection to a B2, beyond the port."""
 
 
@@ -93,6 +93,11 @@ class Go2LinkOptions(Go2Link, UnitreeLinkOptions):
 @dataclass(frozen=True, kw_only=True)
 class G1LinkOptions(UnitreeLinkOptions):
     """The connection to a G1, beyond the port."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class H1LinkOptions(UnitreeGoLink, UnitreeLinkOptions):
+    """The connection to an H1, beyond the port."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,6 +185,17 @@ class G1RunOptions(UnitreeRunOptions):
     """Options of every verb that runs a G1."""
 
     link: G1LinkOptions = field(default_factory=G1LinkOptions)
+    """The connection to the robot, beyond the port."""
+
+    crane: CraneOptions = field(default_factory=CraneOptions)
+    """Options of a robot that must hang on a crane."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class H1RunOptions(UnitreeRunOptions):
+    """Options of every verb that runs an H1."""
+
+    link: H1LinkOptions = field(default_factory=H1LinkOptions)
     """The connection to the robot, beyond the port."""
 
     crane: CraneOptions = field(default_factory=CraneOptions)
