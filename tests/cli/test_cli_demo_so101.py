@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
+from deal_hw.cli import demo_so101
+from deal_hw.cli.calibrate import calibrate
+from deal_hw.cli.demo import KINDS as DEMO
+from deal_hw.cli.demo import demo
 from deal_hw.cli.demo_so101 import POSE_S, POSES, reach_measures, write_poses
 from deal_hw.clock import VirtualClock
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
@@ -15,13 +22,14 @@ from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
-from deal_hw.drivers.so101.description import DRIVEN, JOINTS, emulated_space
+from deal_hw.drivers.so101.description import DRIVEN, JOINTS, WEIGHTED, emulated_space
 from deal_hw.drivers.so101.emulator import so101_device
 from deal_hw.drivers.so101.robot import so101_arm
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import DatasetError
 from deal_hw.motions.joint_targets import make_targets
 from deal_hw.motions.scores.reach import settled
+from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.sim.robots.simulated import SimulatedTruth
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
@@ -104,3 +112,43 @@ def test_poses_are_drawn_by_the_seed_within_the_ranges(tmp_path: Path) -> None:
     assert first.read_text() == again.read_text() != other.read_text()
     found = make_targets(str(first), DRIVEN)
     assert found.poses.shape == (POSES, 6) and found.time_s[-1] == (POSES - 1) * POSE_S
+
+
+@pytest.mark.slow
+@pytest.mark.real_time
+def test_demo_runs_all_five_jobs_and_leaves_a_summary(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All stages over the port, with fewer poses, a local fit and a short training."""
+    monkeypatch.setattr(demo_so101, "POSES", 2)
+    # Its searches are judged in tests/calib; the local fit explains this recording.
+    monkeypatch.setattr(
+        demo_so101, "calibrate", lambda config: calibrate(dataclasses.replace(config, method="local"))
+    )
+    folder = tmp_path / "demo"
+    report = demo(DEMO.settings("so101", out=folder, profile="sensor", seed=1, steps=2000))
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary == json.loads(json.dumps(report.summary))
+    printed = capsys.readouterr().out
+    rows = summary["parameters"]
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    assert {name: row["truth"] for name, row in rows.items()}.items() <= truth["parameters"].items()
+    assert summary["heldout_nrmse"]["calibrated"] < 0.5 * summary["heldout_nrmse"]["nominal"]
+    as_it_is, calibrated = summary["median_error"].values()
+    assert calibrated < as_it_is
+    for joint in WEIGHTED:
+        bias = rows[f"{joint}.encoder_bias"]
+        assert bias["estimate"] == pytest.approx(bias["truth"], abs=0.02)
+    assert summary["latency_s"]["found"] == pytest.approx(summary["latency_s"]["true"], abs=3e-3)
+    for measure in ("joint_error_rad", "weighted_joint_error_rad", "tip_error_m"):
+        assert set(summary[measure]) == {"udr", "retrained"}
+    # The shipped policy reaches the poses; two thousand steps teach little.
+    assert summary["weighted_joint_error_rad"]["udr"] < 0.15 and summary["tip_error_m"]["udr"] < 0.06
+    assert OnnxPolicy(summary["paths"]["policy"]).spec.robot == "so101"
+    assert mujoco.MjModel.from_xml_path(summary["paths"]["mjcf"]).nu == len(JOINTS)
+    assert Path(summary["paths"]["rrd"]).stat().st_size > 10_000
+    assert json.loads((folder / "run.json").read_text(encoding="utf-8"))["status"] == "finished"
+    end = printed[printed.rindex("== inspect") :]
+    assert "missed 2 poses by" in " ".join(end.split())
+    assert "estimates of the calibration beside the hidden truth" in end
+    assert end.count(".encoder_bias") == sum(name.endswith(".encoder_bias") for name in rows)
