@@ -15,7 +15,6 @@ import queue
 import sys
 import threading
 import types
-from collections.abc import MutableSequence
 from typing import Any
 
 _PORTS = dict(pair.split("=", 1) for pair in os.environ.get("DEAL_HW_CLIENT_PORTS", "").split(",") if pair)
@@ -91,8 +90,6 @@ for _patch in (_serial, _can) if _PORTS else ():
 
 class _EmptyModule(types.ModuleType):
     """Each name in it is an empty class, from which a program may derive its own."""
-
-    __path__: MutableSequence[str] = []  # noqa: RUF012
 
     def __getattr__(self, name: str) -> type:
         if name.startswith("__"):
