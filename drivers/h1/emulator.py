@@ -25,8 +25,8 @@ from deal_hw.drivers.h1.joints import JOINTS, MODES, ORDER, SERVO_MODE, TORSO
 from deal_hw.drivers.unitree.emulated_device import require_finite
 from deal_hw.drivers.unitree.emulated_humanoid import EmulatedHumanoid, HumanoidTruth
 from deal_hw.drivers.unitree.go_messages.low_command import (
-    LowCommand,
-    LowCommandEncoder,
+    GoCommand,
+    GoCommandEncoder,
     decode_low_command,
 )
 from deal_hw.drivers.unitree.go_messages.low_state import LowState, encode_low_state
@@ -59,7 +59,7 @@ class H1Truth(HumanoidTruth):
     machine: ClassVar[EmulatedHumanoid] = H1
 
 
-class H1Device(HungDevice[LowCommand]):
+class H1Device(HungDevice[GoCommand]):
     """An emulated H1 without real time and wire; its pelvis is held in the air, its inertial sensor turns.
 
     Attributes:
@@ -85,7 +85,7 @@ class H1Device(HungDevice[LowCommand]):
         tick_ms: int = 0,
     ) -> None:
         self._plan = plan or H1FaultPlan()
-        self._encoder = LowCommandEncoder(ORDER.motors, MODES)
+        self._encoder = GoCommandEncoder(ORDER.motors, MODES)
         super().__init__(
             truth,
             self._plan,
@@ -114,14 +114,14 @@ class H1Device(HungDevice[LowCommand]):
         # The vertical is the torso's own z axis, too.
         return orientation, turning, self._sim.specific_force()
 
-    def _hold(self, position: FloatArray, stiffness: float, damping: float) -> LowCommand:
+    def _hold(self, position: FloatArray, stiffness: float, damping: float) -> GoCommand:
         zero, ones = np.zeros(len(position)), np.ones(len(position))
-        return LowCommand(position, zero, stiffness * ones, damping * ones, zero, SERVO_MODE)
+        return GoCommand(position, zero, stiffness * ones, damping * ones, zero, SERVO_MODE)
 
-    def _encode(self, command: LowCommand) -> bytes:
+    def _encode(self, command: GoCommand) -> bytes:
         return self._encoder.encode(command)
 
-    def _decode(self, payload: bytes) -> LowCommand:
+    def _decode(self, payload: bytes) -> GoCommand:
         command = decode_low_command(payload, ORDER.motors)
         require_finite(command)
         return command

@@ -17,7 +17,7 @@ from deal_hw.drivers.h1.messages import FOUR_LEGS, H1Refusals, H1StateDecoder, h
 from deal_hw.drivers.unitree.claim import WireClaim
 from deal_hw.drivers.unitree.crane import STOP_BUTTONS, HungRobot, hung, on_crane, wording
 from deal_hw.drivers.unitree.go_messages.body import body_state
-from deal_hw.drivers.unitree.go_messages.low_command import LowCommand, LowCommandEncoder
+from deal_hw.drivers.unitree.go_messages.low_command import GoCommand, GoCommandEncoder
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.tick_stream import TickStream
@@ -84,7 +84,7 @@ class H1Robot(HungRobot[LowStateFrame]):
         if state_check not in get_args(StateCheck):
             raise UnknownNameError("check of the H1's states", state_check, get_args(StateCheck))
         strict, decoder = state_check == "strict", H1StateDecoder()
-        self._encoder = LowCommandEncoder(ORDER.motors, MODES)
+        self._encoder = GoCommandEncoder(ORDER.motors, MODES)
         stream = TickStream("h1", lambda payload: decoder.decode(payload, strict), H1Refusals)
         super().__init__(transport, clock, stop_buttons, stream, hung_on_crane=hung_on_crane)
 
@@ -101,7 +101,7 @@ class H1Robot(HungRobot[LowStateFrame]):
         damping: FloatArray,
         effort: FloatArray,
     ) -> bytes:
-        return self._encoder.encode(LowCommand(position, velocity, stiffness, damping, effort, SERVO_MODE))
+        return self._encoder.encode(GoCommand(position, velocity, stiffness, damping, effort, SERVO_MODE))
 
     def _read_info(self) -> H1Info | None:
         if self._frame is None:

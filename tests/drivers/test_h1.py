@@ -30,8 +30,8 @@ from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.unitree.go_messages import layout
 from deal_hw.drivers.unitree.go_messages.low_command import (
-    LowCommand,
-    LowCommandEncoder,
+    GoCommand,
+    GoCommandEncoder,
     decode_low_command,
 )
 from deal_hw.drivers.unitree.humanoid import part_of, per_joint
@@ -39,7 +39,7 @@ from deal_hw.errors import ConfigurationError, SafetyError, UnknownNameError, Wr
 from deal_hw.findings import Severity
 from deal_hw.robots import robot_entry
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command, run_cycles
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 KNEE = JOINTS.index("left_knee_joint")
@@ -286,16 +286,16 @@ def test_a_motor_in_the_other_mode_is_off() -> None:
     target[[KNEE, JOINTS.index("left_elbow_joint"), TORSO]] += 0.3
     zero = np.zeros(COUNT)
 
-    def reached(modes: FloatArray) -> FloatArray:
+    def reached(modes: IntArray) -> FloatArray:
         device = H1Device(H1Truth.nominal(), controller="")
-        command = LowCommand(
+        command = GoCommand(
             target, zero, np.array(DESCRIPTION.stiffness), np.array(DESCRIPTION.damping), zero, modes
         )
-        payload = LowCommandEncoder(ORDER.motors, np.zeros(layout.SLOTS, np.int64)).encode(command)
+        payload = GoCommandEncoder(ORDER.motors, np.zeros(layout.SLOTS, np.int64)).encode(command)
         for _ in range(1500):
             device.receive(topics.LOW_COMMAND, payload)
             device.tick()
-        return np.abs(device.true_position - target)
+        return np.asarray(np.abs(device.true_position - target))
 
     assert reached(SERVO_MODE).max() < 0.06
     other = SERVO_MODE.copy()
@@ -310,10 +310,10 @@ def test_the_vendors_example_moves_it_to_zero() -> None:
     start = device.true_position.copy()
     weak = SERVO_MODE == 0x01
     zero = np.zeros(COUNT)
-    encoder = LowCommandEncoder(ORDER.motors, np.zeros(layout.SLOTS, np.int64))
+    encoder = GoCommandEncoder(ORDER.motors, np.zeros(layout.SLOTS, np.int64))
     for step in range(1, 1201):
         share = min(1.0, step / 1000)
-        command = LowCommand(
+        command = GoCommand(
             (1.0 - share) * start,
             zero,
             np.where(weak, 60.0, 200.0),

@@ -14,8 +14,8 @@ from deal_hw.drivers.go2.messages.wire import ORDER
 from deal_hw.drivers.unitree.go_messages import layout
 from deal_hw.drivers.unitree.go_messages.layout import SLOTS, WireOrder
 from deal_hw.drivers.unitree.go_messages.low_command import (
-    LowCommand,
-    LowCommandEncoder,
+    GoCommand,
+    GoCommandEncoder,
     decode_low_command,
 )
 from deal_hw.drivers.unitree.go_messages.low_state import LowState, LowStateDecoder, encode_low_state
@@ -25,10 +25,10 @@ MOTORS = st.lists(st.integers(0, SLOTS - 1), min_size=1, max_size=SLOTS, unique=
 FEET = st.permutations(range(4))
 
 
-def command(rng: np.random.Generator, count: int) -> LowCommand:
+def command(rng: np.random.Generator, count: int) -> GoCommand:
     """Return a command of numbers that survive 32 bits."""
     q, dq, kp, kd, tau = rng.integers(-4000, 4000, (5, count)) / 16.0
-    return LowCommand(q, dq, kp, kd, tau, rng.integers(0, 256, count))
+    return GoCommand(q, dq, kp, kd, tau, rng.integers(0, 256, count))
 
 
 def state(rng: np.random.Generator, count: int) -> LowState:
@@ -75,7 +75,7 @@ def test_a_command_comes_back_whatever_the_motors(motors: list[int], seed: int) 
     """Each motor's numbers are in its own slot; the others keep the vendor's stop values and their mode."""
     slots = np.array(motors)
     sent = command(np.random.default_rng(seed), len(slots))
-    encoder = LowCommandEncoder(slots, SPARE)
+    encoder = GoCommandEncoder(slots, SPARE)
     # What an earlier command left in the buffer must not remain.
     encoder.encode(command(np.random.default_rng(seed + 1), len(slots)))
     payload = encoder.encode(sent)
@@ -117,6 +117,6 @@ def test_the_go2_is_one_order_among_others(seed: int) -> None:
             sent.position, sent.velocity, sent.stiffness, sent.damping, sent.effort, sent.mode
         )
     )
-    assert payload == LowCommandEncoder(ORDER.motors, np.ones(SLOTS, np.int64)).encode(sent)
+    assert payload == GoCommandEncoder(ORDER.motors, np.ones(SLOTS, np.int64)).encode(sent)
     assert go2_state.encode_low_state(said) == encode_low_state(said, ORDER)
     assert_same(go2_state.decode_low_state(encode_low_state(said, ORDER)).values(), said)

@@ -14,13 +14,13 @@ from deal_hw.types import IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class LowCommand(low_command.LowCommand):
+class LowCommand(low_command.GoCommand):
     """PD targets for the 12 motors, arrays (12,) in model order; the motors are on unless told otherwise."""
 
     mode: IntArray = field(default_factory=lambda: np.ones(12, np.int64))
 
 
-class LowCommandEncoder(low_command.LowCommandEncoder):
+class LowCommandEncoder(low_command.GoCommandEncoder):
     """Writes LowCmds for 12 motors into a buffer of its own and returns copies; one for each thread.
 
     Args:

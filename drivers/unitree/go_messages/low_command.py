@@ -27,7 +27,7 @@ _LARGEST: Final = 1e30
 
 
 @dataclass(frozen=True, slots=True)
-class LowCommand:
+class GoCommand:
     """PD targets for the motors, arrays (J,) in the robot's own order.
 
     Attributes:
@@ -49,8 +49,8 @@ class LowCommand:
     level: int = LEVEL_LOW
 
 
-class LowCommandEncoder:
-    """Writes LowCommands into a buffer of its own and returns copies; one for each thread.
+class GoCommandEncoder:
+    """Writes LowCmds into a buffer of its own and returns copies; one for each thread.
 
     Args:
         motors: Motor slot of each joint, (J,).
@@ -82,7 +82,7 @@ class LowCommandEncoder:
         self._mode, self._level = b"", -1
         self._start = CRC_START
 
-    def encode(self, command: LowCommand) -> bytes:
+    def encode(self, command: GoCommand) -> bytes:
         """Return the command as CDR with header and checksum, 812 bytes.
 
         Raises:
@@ -103,14 +103,14 @@ class LowCommandEncoder:
         self._buffer[808:] = crc.to_bytes(4, "little")
         return bytes(self._buffer)
 
-    def _set_modes(self, command: LowCommand) -> None:
+    def _set_modes(self, command: GoCommand) -> None:
         self._bytes[self._mode_at] = command.mode
         self._buffer[6] = command.level
         # The struct's first 28 bytes hold no motor's numbers, so their part of the checksum is kept.
         self._start = words_crc(low_command_image(bytes(self._buffer))[:28])
 
 
-def decode_low_command(payload: bytes, motors: IntArray) -> LowCommand:
+def decode_low_command(payload: bytes, motors: IntArray) -> GoCommand:
     """Return the command in a LowCmd, as a robot with these motors would take it.
 
     Args:
@@ -134,4 +134,4 @@ def decode_low_command(payload: bytes, motors: IntArray) -> LowCommand:
     numbers = record["motor"][motors]
     modes = np.frombuffer(payload, "u1")[layout.COMMAND_MODE_AT[motors]]
     q, dq, kp, kd, tau = (numbers[name].astype(np.float64) for name in ("q", "dq", "kp", "kd", "tau"))
-    return LowCommand(q, dq, kp, kd, tau, modes.astype(np.int64), payload[6])
+    return GoCommand(q, dq, kp, kd, tau, modes.astype(np.int64), payload[6])
