@@ -47,6 +47,6 @@ def facts() -> dict[str, str]:
 
 def stamped_facts() -> tuple[dict[str, str], float]:
     """Return the facts, and this machine's clock [s since 1970]."""
-    import time
+    import datetime
 
-    return facts(), time.time()
+    return facts(), datetime.datetime.now(datetime.timezone.utc).timestamp()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import socket
-import time
 from collections.abc import Mapping
+from datetime import datetime, timezone
 from typing import Any, Final
 
 from deal_hw.errors import ClusterError, short
@@ -42,7 +42,7 @@ def check_nodes(threads: int) -> None:
     # As code: on a node without deal-hw the name of a function means nothing.
     cloudpickle.register_pickle_by_value(facts)
     try:
-        ask, began = ray.remote(num_cpus=0, max_retries=1)(facts.stamped_facts), time.time()
+        ask, began = ray.remote(num_cpus=0, max_retries=1)(facts.stamped_facts), _clock()
         asked = {
             ask.options(
                 scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
@@ -70,7 +70,7 @@ def check_nodes(threads: int) -> None:
             ) from err
         if why := difference(mine, theirs):
             raise ClusterError(f"node {name} {why}")
-        if apart := clocks_apart(clock, began, time.time()):
+        if apart := clocks_apart(clock, began, _clock()):
             logging.getLogger(__name__).warning("node %s: %s", name, apart)
 
 
@@ -107,6 +107,11 @@ def difference(mine: Mapping[str, str], theirs: Mapping[str, str]) -> str:
                 "on all machines"
             )
     return ""
+
+
+def _clock() -> float:
+    """Return this machine's clock, which other machines share [s since 1970]."""
+    return datetime.now(timezone.utc).timestamp()
 
 
 def _name(node: Mapping[str, Any]) -> str:

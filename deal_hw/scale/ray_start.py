@@ -8,12 +8,14 @@ itself, and `ray.init` raises after 30 s. Often the next start is faster, since 
 from __future__ import annotations
 
 import logging
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import psutil
 
 from deal_hw.scale.ray_errors import explained, too_slow
-from deal_hw.scale.where import Where
+
+if TYPE_CHECKING:
+    from deal_hw.scale.where import Where
 
 STARTS: Final = 3
 """Times that Ray is started until it counts as not to be started."""
