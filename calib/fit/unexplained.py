@@ -28,7 +28,8 @@ class Unexplained(Finding):
         """Return the alarm."""
         if place:
             found = Finding.alarm(
-                f"Residuals are {' and '.join(facts)}. None of the known causes explains them. {place}",
+                f"Residuals are {' and '.join(facts)}. None of the known causes explains them. "
+                f"{place.removesuffix('.')}.",
                 "The model lacks something that the robot has, or a sensor is wrong there: blind or bent in "
                 "a part of its range, or with another scale. The intervals count all of it as noise.",
                 "Plot the measured positions there, and check the sensor's scale against a known angle or "
