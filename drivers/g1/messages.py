@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from deal_hw.drivers.g1.joints import MOTORS
 from deal_hw.drivers.unitree.cdr import CDR_HEADER, field_mask, packed, words_crc
+from deal_hw.drivers.unitree.joint_frame import JointFrame, hot_words
 from deal_hw.errors import ConfigurationError, FrameError
 from deal_hw.types import FloatArray, IntArray
 
@@ -29,7 +30,6 @@ MODE_PR: Final = 0
 """mode_pr: ankles and waist as pitch and roll joints (1: as their two parallel motors)."""
 _LARGEST: Final = 1e30
 """Bound on the sum of squares of a command's numbers."""
-_F4: Final = np.dtype("<f4")
 
 _MOTOR_COMMAND: Final = packed(
     28,
@@ -243,64 +243,23 @@ class G1State:
     version: tuple[int, int] = (0, 0)
 
 
-_BODY_WORDS: Final = np.arange(5, 18)
-"""32-bit words of orientation, gyroscope, accelerometer and rpy in a LowState."""
+_BODY_WORD: Final = 5
 _MOTOR_WORD: Final = 19
 _MOTOR_WORDS: Final = 14
 
 
-class G1Frame:
+class G1Frame(JointFrame):
     """A received LowState: attributes as :class:`G1State`'s, read from the bytes on access.
 
     Attributes:
-        payload: The bytes.
         slots: Motor numbers of the joints, (J,).
     """
 
-    __slots__ = ("_hot", "payload", "slots")
+    __slots__ = ("slots",)
 
-    def __init__(self, payload: bytes, slots: IntArray, hot: FloatArray) -> None:
-        self.payload, self.slots, self._hot = payload, slots, hot
-
-    @property
-    def position(self) -> FloatArray:
-        """q, (J,) [rad]."""
-        return self._part(0)
-
-    @property
-    def velocity(self) -> FloatArray:
-        """The joints' dq, (J,) [rad/s]."""
-        return self._part(1)
-
-    @property
-    def acceleration(self) -> FloatArray:
-        """The joints' ddq, (J,) [rad/s²]."""
-        return self._part(2)
-
-    @property
-    def effort(self) -> FloatArray:
-        """The motors' tau_est, (J,) [N·m]."""
-        return self._part(3)
-
-    @property
-    def orientation(self) -> FloatArray:
-        """Quaternion wxyz, pelvis in the world, (4,)."""
-        return self._hot[-13:-9]
-
-    @property
-    def angular_velocity(self) -> FloatArray:
-        """In the pelvis's frame, (3,) [rad/s]."""
-        return self._hot[-9:-6]
-
-    @property
-    def specific_force(self) -> FloatArray:
-        """In the pelvis's frame, (3,) [m/s²]."""
-        return self._hot[-6:-3]
-
-    @property
-    def rpy(self) -> FloatArray:
-        """Roll, pitch, yaw, (3,) [rad]."""
-        return self._hot[-3:]
+    def __init__(self, payload: bytes, slots: IntArray, hot: IntArray) -> None:
+        super().__init__(payload, hot, len(slots))
+        self.slots = slots
 
     @property
     def casing(self) -> IntArray:
@@ -354,10 +313,6 @@ class G1Frame:
         """Version of the firmware, two words."""
         return int.from_bytes(self.payload[4:8], "little"), int.from_bytes(self.payload[8:12], "little")
 
-    def _part(self, number: int) -> FloatArray:
-        count = len(self.slots)
-        return self._hot[number * count : (number + 1) * count]
-
     def _words(self, kind: str, first: int) -> IntArray:
         """Return an integer of each motor; ``first``: its index among numbers of this kind in slot 0."""
         stride = 56 // np.dtype(kind).itemsize
@@ -373,8 +328,7 @@ class G1StateDecoder:
 
     def __init__(self, joints: Sequence[str]) -> None:
         self.slots = slots_of(joints)
-        first = _MOTOR_WORD + _MOTOR_WORDS * self.slots
-        self._hot = np.concatenate([*(first + part for part in range(4)), _BODY_WORDS])
+        self._hot = hot_words(self.slots, _MOTOR_WORD, _MOTOR_WORDS, _BODY_WORD)
 
     def decode(self, payload: bytes) -> G1Frame:
         """Return the state in a LowState. Reserved fields are ignored: newer firmware may use them.
@@ -386,7 +340,7 @@ class G1StateDecoder:
         """
         _check(payload, "LowState")
         _verify(payload, "LowState")
-        return G1Frame(payload, self.slots, np.frombuffer(payload, _F4)[self._hot].astype(np.float64))
+        return G1Frame(payload, self.slots, self._hot)
 
 
 def encode_low_state(state: G1State, joints: Sequence[str]) -> bytes:

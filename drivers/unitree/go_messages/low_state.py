@@ -17,6 +17,7 @@ from deal_hw.drivers.unitree.go_messages.frames import (
     verify_crc,
 )
 from deal_hw.drivers.unitree.go_messages.layout import LOW_STATE_BYTES, WireOrder
+from deal_hw.drivers.unitree.joint_frame import JointFrame, hot_words
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray, IntArray
 
@@ -82,70 +83,28 @@ class LowState:
     version: tuple[int, int] = (0, 0)
 
 
-_BODY_WORDS: Final = np.arange(7, 20)
-"""32-bit words of orientation, gyroscope, accelerometer and rpy in a LowState."""
+_BODY_WORD: Final = 7
 _MOTOR_WORD: Final = 21
 _MOTOR_WORDS: Final = 12
 _LOST_WORD: Final = 29
 _TEMPERATURE_AT: Final = 112
 _MOTOR_BYTES: Final = 48
 _F4: Final = np.dtype("<f4")
-_F8: Final = np.dtype(np.float64)
 
 
-class LowStateFrame:
+class LowStateFrame(JointFrame):
     """A received LowState: attributes as :class:`LowState`'s, read from the bytes on access.
 
     Attributes:
-        payload: The bytes.
         crc_checked: Whether the checksum was verified.
         order: Where the robot's joints and feet are.
     """
 
-    __slots__ = ("_hot", "crc_checked", "order", "payload")
+    __slots__ = ("crc_checked", "order")
 
-    def __init__(self, payload: bytes, hot: FloatArray, crc_checked: bool, order: WireOrder) -> None:
-        self.payload, self._hot, self.crc_checked, self.order = payload, hot, crc_checked, order
-
-    @property
-    def position(self) -> FloatArray:
-        """q, (J,) [rad]."""
-        return self._part(0)
-
-    @property
-    def velocity(self) -> FloatArray:
-        """The joints' dq, (J,) [rad/s]."""
-        return self._part(1)
-
-    @property
-    def acceleration(self) -> FloatArray:
-        """The joints' ddq, (J,) [rad/s²]."""
-        return self._part(2)
-
-    @property
-    def effort(self) -> FloatArray:
-        """The motors' tau_est, (J,) [N·m]."""
-        return self._part(3)
-
-    @property
-    def orientation(self) -> FloatArray:
-        """Quaternion wxyz, base in the world, (4,)."""
-        return self._hot[-13:-9]
-
-    @property
-    def angular_velocity(self) -> FloatArray:
-        """In the base's frame, (3,) [rad/s]."""
-        return self._hot[-9:-6]
-
-    @property
-    def specific_force(self) -> FloatArray:
-        """In the base's frame, (3,) [m/s²]."""
-        return self._hot[-6:-3]
-
-    @property
-    def rpy(self) -> FloatArray:
-        """Roll, pitch, yaw, (3,) [rad]."""
-        return self._hot[-3:]
+    def __init__(self, payload: bytes, hot: IntArray, crc_checked: bool, order: WireOrder) -> None:
+        super().__init__(payload, hot, len(order.motors))
+        self.crc_checked, self.order = crc_checked, order
 
     @property
     def tick_ms(self) -> int:
@@ -222,10 +181,6 @@ class LowStateFrame:
             version=(int(record["version"][0]), int(record["version"][1])),
         )
 
-    def _part(self, number: int) -> FloatArray:
-        count = len(self.order.motors)
-        return self._hot[number * count : (number + 1) * count]
-
 
 class LowStateDecoder:
     """Reads LowStates of a robot.
@@ -236,8 +191,7 @@ class LowStateDecoder:
 
     def __init__(self, order: WireOrder) -> None:
         self._order = order
-        first = _MOTOR_WORD + _MOTOR_WORDS * order.motors
-        self._hot = np.concatenate([*(first + part for part in range(4)), _BODY_WORDS])
+        self._hot = hot_words(order.motors, _MOTOR_WORD, _MOTOR_WORDS, _BODY_WORD)
 
     def decode(self, payload: bytes, strict: bool = True) -> LowStateFrame:
         """Return the state in a LowState. Reserved fields are ignored: newer firmware may use them.
@@ -255,8 +209,7 @@ class LowStateDecoder:
             check_frame(payload, "LowState", head=strict)
         if strict:
             verify_crc(payload, "LowState")
-        hot = np.frombuffer(payload, _F4)[self._hot].astype(_F8)
-        return LowStateFrame(payload, hot, strict, self._order)
+        return LowStateFrame(payload, self._hot, strict, self._order)
 
 
 def encode_low_state(state: LowState, order: WireOrder) -> bytes:
