@@ -17,8 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.drivers.g1.joints import MOTORS
-from deal_hw.drivers.unitree.cdr import CDR_HEADER, field_mask, packed, words_crc
+from deal_hw.drivers.unitree.cdr import (
+    CDR_HEADER,
+    check_length,
+    field_mask,
+    packed,
+    verify_words,
+    words_crc,
+)
 from deal_hw.drivers.unitree.joint_frame import JointFrame, hot_words
+from deal_hw.drivers.unitree.motor_command import check_numbers
 from deal_hw.errors import ConfigurationError, FrameError
 from deal_hw.types import FloatArray, IntArray
 
@@ -28,8 +36,6 @@ LOW_COMMAND_BYTES: Final = 1004
 LOW_STATE_BYTES: Final = 2092
 MODE_PR: Final = 0
 """mode_pr: ankles and waist as pitch and roll joints (1: as their two parallel motors)."""
-_LARGEST: Final = 1e30
-"""Bound on the sum of squares of a command's numbers."""
 
 _MOTOR_COMMAND: Final = packed(
     28,
@@ -156,10 +162,7 @@ class G1CommandEncoder:
         values = np.concatenate(
             (command.position, command.velocity, command.effort, command.stiffness, command.damping)
         )
-        if not values.dot(values) < _LARGEST:
-            raise FrameError(
-                "a LowCmd's numbers must be finite and of a plausible size; this command is not sent"
-            )
+        check_numbers(values)
         self._buffer[4], self._buffer[5] = command.mode_pr, command.mode_machine
         self._bytes[COMMAND_MODE_AT[self._slots]] = command.mode
         motors = self._record["motor"]
@@ -390,9 +393,7 @@ def _check(payload: bytes, name: str) -> None:
         FrameError: Wrong length or header.
     """
     size = LOW_COMMAND_BYTES if name == "LowCmd" else LOW_STATE_BYTES
-    if len(payload) != size:
-        hint = ": the CDR header is missing" if len(payload) == size - len(CDR_HEADER) else ""
-        raise FrameError(f"{name}: {len(payload)} bytes, expected {size} with the CDR header{hint}")
+    check_length(payload, name, size)
     if payload[:4] != CDR_HEADER:
         raise FrameError(
             f"{name}: the CDR header is {payload[:4].hex(' ')}, expected {CDR_HEADER.hex(' ')} (version 1, "
@@ -407,13 +408,7 @@ def _verify(payload: bytes, name: str) -> None:
         FrameError: It is wrong.
     """
     image = low_command_image if name == "LowCmd" else low_state_image
-    given = int.from_bytes(payload[-4:], "little")
-    if words_crc(image(payload)) == given:
-        return
-    # Padding has no meaning, and the sender computes the checksum with 0 there.
-    found = words_crc(image((np.frombuffer(payload, "u1") & _mask(name)).tobytes()))
-    if found != given:
-        raise FrameError(f"{name}: the checksum is 0x{given:08X}, expected 0x{found:08X}: corrupt on the way")
+    verify_words(payload, name, image, _mask)
 
 
 @functools.cache

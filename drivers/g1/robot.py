@@ -26,7 +26,7 @@ from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.claim import WireClaim
 from deal_hw.drivers.unitree.crane import STOP_BUTTONS, HungRobot, hung, on_crane
 from deal_hw.drivers.unitree.motor_command import MODE_SERVO
-from deal_hw.drivers.unitree.remote import Remote
+from deal_hw.drivers.unitree.remote import Remote, sticks_of
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import WrongDeviceError
@@ -161,9 +161,6 @@ class G1Robot(HungRobot[G1Frame]):
         return ""
 
     def _body(self, frame: G1Frame, remote: Remote | None) -> BodyState:
-        sticks = np.zeros(4)
-        if remote is not None:
-            sticks[:] = remote.left_x, remote.left_y, remote.right_x, remote.right_y
         return BodyState(
             orientation=frame.orientation,
             angular_velocity=frame.angular_velocity,
@@ -174,7 +171,7 @@ class G1Robot(HungRobot[G1Frame]):
             battery=math.nan,
             voltage=float(np.median(frame.voltage)),
             current=math.nan,
-            sticks=sticks,
+            sticks=sticks_of(remote),
             buttons=-1 if remote is None else remote.buttons,
         )
 

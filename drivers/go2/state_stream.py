@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 from deal_hw.drivers.go2.messages.low_state import decode_low_state
-from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck
+from deal_hw.drivers.go2.messages.refusals import Refusals, StateCheck, is_strict
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.tick_stream import TickStream
-from deal_hw.errors import UnknownNameError
 
 
 class StateStream(TickStream[LowStateFrame]):
@@ -23,7 +20,5 @@ class StateStream(TickStream[LowStateFrame]):
     """
 
     def __init__(self, check: StateCheck = "strict", refusals: type[Refusals] = Refusals) -> None:
-        if check not in get_args(StateCheck):
-            raise UnknownNameError("check of the Go2's states", check, get_args(StateCheck))
-        strict = check == "strict"
+        strict = is_strict(check, "Go2")
         super().__init__(refusals.robot[0], lambda payload: decode_low_state(payload, strict), refusals)

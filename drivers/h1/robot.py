@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar, Final, get_args
+from typing import ClassVar, Final
 
 import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.go2.messages.refusals import StateCheck
+from deal_hw.drivers.go2.messages.refusals import StateCheck, is_strict
 from deal_hw.drivers.h1.description import DESCRIPTION
 from deal_hw.drivers.h1.joints import MODES, ORDER, SERVO_MODE
 from deal_hw.drivers.h1.messages import FOUR_LEGS, H1Refusals, H1StateDecoder, has_four_legs, pelvis_of
@@ -22,7 +22,7 @@ from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
-from deal_hw.errors import UnknownNameError, WrongDeviceError
+from deal_hw.errors import WrongDeviceError
 from deal_hw.transport import TopicTransport
 from deal_hw.types import BodyState, FloatArray
 
@@ -81,9 +81,7 @@ class H1Robot(HungRobot[LowStateFrame]):
         state_check: StateCheck = "strict",
         hung_on_crane: bool = False,
     ) -> None:
-        if state_check not in get_args(StateCheck):
-            raise UnknownNameError("check of the H1's states", state_check, get_args(StateCheck))
-        strict, decoder = state_check == "strict", H1StateDecoder()
+        strict, decoder = is_strict(state_check, "H1"), H1StateDecoder()
         self._encoder = GoCommandEncoder(ORDER.motors, MODES)
         stream = TickStream("h1", lambda payload: decoder.decode(payload, strict), H1Refusals)
         super().__init__(transport, clock, stop_buttons, stream, hung_on_crane=hung_on_crane)

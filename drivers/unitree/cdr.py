@@ -10,12 +10,14 @@ struct's image is the CDR body with a few more bytes of padding. Source: crc32_c
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from fastcrc import crc32
+
+from deal_hw.errors import FrameError
 
 CDR_HEADER: Final = b"\x00\x01\x00\x00"
 """CDR version 1, little-endian."""
@@ -27,6 +29,48 @@ def words_crc(image: bytes | bytearray, start: int = CRC_START) -> int:
     words = array("I", image)
     words.byteswap()
     return int(crc32.mpeg_2(words, start))
+
+
+def check_length(payload: bytes, name: str, size: int) -> None:
+    """Refuse a message of another length.
+
+    Raises:
+        FrameError: It has another; without the CDR header, the message says so.
+    """
+    if len(payload) != size:
+        hint = ": the CDR header is missing" if len(payload) == size - len(CDR_HEADER) else ""
+        raise FrameError(f"{name}: {len(payload)} bytes, expected {size} with the CDR header{hint}")
+
+
+def masked(payload: bytes, mask: npt.NDArray[np.uint8]) -> bytes:
+    """Return a message with zeros where its mask has them."""
+    return (np.frombuffer(payload, "u1") & mask).tobytes()
+
+
+def verify_words(
+    payload: bytes,
+    name: str,
+    image: Callable[[bytes], bytes],
+    mask: Callable[[str], npt.NDArray[np.uint8]],
+) -> None:
+    """Refuse a message whose checksum, its last word, is wrong.
+
+    Args:
+        payload: Of the right length.
+        name: The message.
+        image: Returns the C struct's image of a payload, without its last word.
+        mask: Returns the message's :func:`field_mask`.
+
+    Raises:
+        FrameError: It is wrong.
+    """
+    given = int.from_bytes(payload[-4:], "little")
+    if words_crc(image(payload)) == given:
+        return
+    # Padding has no meaning, and the sender computes the checksum with 0 there.
+    found = words_crc(image(masked(payload, mask(name))))
+    if found != given:
+        raise FrameError(f"{name}: the checksum is 0x{given:08X}, expected 0x{found:08X}: corrupt on the way")
 
 
 def packed(size: int, fields: Mapping[str, tuple[Any, int]]) -> np.dtype[np.void]:

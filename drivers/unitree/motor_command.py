@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
+from deal_hw.errors import FrameError
 from deal_hw.types import FloatArray, IntArray
 
 MODE_OFF: Final = 0x00
@@ -11,6 +12,22 @@ MODE_SERVO: Final = 0x01
 POSITION_STOP: Final = 2.146e9
 VELOCITY_STOP: Final = 16000.0
 """Position and velocity in the vendor's examples for motors without a command; kp = kd = 0 there."""
+
+
+_LARGEST: Final = 1e30
+"""Bound on the sum of squares of a command's numbers; stop values have 5.5e19."""
+
+
+def check_numbers(values: FloatArray) -> None:
+    """Refuse a command's numbers, (n,), of which one is not finite or implausibly large.
+
+    Raises:
+        FrameError: One is.
+    """
+    if not values.dot(values) < _LARGEST:
+        raise FrameError(
+            "a LowCmd's numbers must be finite and of a plausible size; this command is not sent"
+        )
 
 
 class MotorCommand(Protocol):

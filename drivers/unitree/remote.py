@@ -11,8 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from deal_hw.drivers.unitree.cdr import CDR_HEADER
 from deal_hw.errors import ConfigurationError, FrameError, UnknownNameError
+from deal_hw.types import FloatArray
 
 BUTTONS: Final = (
     "R1",
@@ -61,6 +64,13 @@ class Remote:
     def holds(self, mask: int) -> bool:
         """Return whether all buttons of a mask are held; an empty mask is never held."""
         return mask != 0 and self.buttons & mask == mask
+
+
+def sticks_of(remote: Remote | None) -> FloatArray:
+    """Return left x and y, right x and y, (4,); zeros for none in reach."""
+    if remote is None:
+        return np.zeros(4)
+    return np.array((remote.left_x, remote.left_y, remote.right_x, remote.right_y))
 
 
 def button_mask(names: Iterable[str]) -> int:

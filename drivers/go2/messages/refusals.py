@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final, Literal, get_args
 
 from deal_hw.drivers.go2.messages.simulated import UNITREE_MUJOCO, is_unitree_mujoco
 from deal_hw.drivers.unitree.go_messages.layout import LOW_STATE_BYTES
 from deal_hw.drivers.unitree.refusals import StateRefusals
-from deal_hw.errors import FrameError
+from deal_hw.errors import FrameError, UnknownNameError
 
 StateCheck = Literal["strict", "length"]
 """Checks that a LowState must pass: all, or all but head and checksum."""
@@ -18,6 +18,21 @@ OTHER_RULE: Final = (
 ANOTHER_ROBOT: Final = (
     "it may be another robot type (G1 and H1 use this topic, too): choose the right robot or network"
 )
+
+
+def is_strict(check: StateCheck, kind: str) -> bool:
+    """Return whether head and checksum are checked, too.
+
+    Args:
+        check: The check's name.
+        kind: The robot, as its maker writes it.
+
+    Raises:
+        UnknownNameError: There is no such check.
+    """
+    if check not in get_args(StateCheck):
+        raise UnknownNameError(f"check of the {kind}'s states", check, get_args(StateCheck))
+    return check == "strict"
 
 
 class Refusals(StateRefusals):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
-from deal_hw.drivers.unitree.remote import Remote
+from deal_hw.drivers.unitree.remote import Remote, sticks_of
 from deal_hw.types import BodyState
 
 
@@ -16,9 +16,6 @@ def body_state(frame: LowStateFrame, remote: Remote | None) -> BodyState:
         frame: The state.
         remote: Its decoded remote; None if none is in reach.
     """
-    sticks = np.zeros(4)
-    if remote is not None:
-        sticks[:] = remote.left_x, remote.left_y, remote.right_x, remote.right_y
     return BodyState(
         orientation=frame.orientation,
         angular_velocity=frame.angular_velocity,
@@ -29,6 +26,6 @@ def body_state(frame: LowStateFrame, remote: Remote | None) -> BodyState:
         battery=frame.battery_percent / 100,
         voltage=frame.voltage,
         current=frame.current,
-        sticks=sticks,
+        sticks=sticks_of(remote),
         buttons=-1 if remote is None else remote.buttons,
     )

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.drivers.unitree.cdr import CDR_HEADER, field_mask, words_crc
+from deal_hw.drivers.unitree.cdr import CDR_HEADER, check_length, field_mask, masked, verify_words
 from deal_hw.drivers.unitree.go_messages import layout
 from deal_hw.drivers.unitree.go_messages.layout import LOW_COMMAND_BYTES, LOW_STATE_BYTES
 from deal_hw.errors import FrameError
@@ -49,9 +49,7 @@ def check_frame(payload: bytes, name: str, *, head: bool = True) -> None:
         FrameError: Wrong length, header or head; the message names it.
     """
     size = LOW_COMMAND_BYTES if name == "LowCmd" else LOW_STATE_BYTES
-    if len(payload) != size:
-        hint = ": the CDR header is missing" if len(payload) == size - len(CDR_HEADER) else ""
-        raise FrameError(f"{name}: {len(payload)} bytes, expected {size} with the CDR header{hint}")
+    check_length(payload, name, size)
     if payload[:2] == HEAD:
         raise FrameError(
             f"{name}: {size} bytes that begin with FE EF are the C struct's image, which has another layout "
@@ -77,18 +75,12 @@ def verify_crc(payload: bytes, name: str) -> None:
         FrameError: It is wrong.
     """
     image = low_command_image if name == "LowCmd" else low_state_image
-    given = int.from_bytes(payload[-4:], "little")
-    if words_crc(image(payload)) == given:
-        return
-    # Padding has no meaning, and the sender computes the checksum with 0 there.
-    found = words_crc(image(without_padding(payload, name)))
-    if found != given:
-        raise FrameError(f"{name}: the checksum is 0x{given:08X}, expected 0x{found:08X}: corrupt on the way")
+    verify_words(payload, name, image, _padding_mask)
 
 
 def without_padding(payload: bytes, name: str) -> bytes:
     """Return a "LowCmd" or "LowState" of the right length with zeros between its fields."""
-    return (np.frombuffer(payload, "u1") & _padding_mask(name)).tobytes()
+    return masked(payload, _padding_mask(name))
 
 
 @functools.cache

@@ -17,13 +17,11 @@ from deal_hw.drivers.unitree.go_messages.frames import (
     verify_crc,
 )
 from deal_hw.drivers.unitree.go_messages.layout import LOW_COMMAND_BYTES
-from deal_hw.drivers.unitree.motor_command import POSITION_STOP, VELOCITY_STOP
+from deal_hw.drivers.unitree.motor_command import POSITION_STOP, VELOCITY_STOP, check_numbers
 from deal_hw.errors import FrameError
 from deal_hw.types import FloatArray, IntArray
 
 _FIELD_COUNT: Final = 5
-_LARGEST: Final = 1e30
-"""Bound on the sum of squares of a command's numbers; stop values have 5.5e19."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +89,7 @@ class GoCommandEncoder:
         values = self._values
         values[0], values[1], values[2] = command.position, command.velocity, command.effort
         values[3], values[4] = command.stiffness, command.damping
-        if not self._flat.dot(self._flat) < _LARGEST:
-            raise FrameError(
-                "a LowCmd's numbers must be finite and of a plausible size; this command is not sent"
-            )
+        check_numbers(self._flat)
         self._rows[self._used] = values.take(self._wire_rows)
         if (mode := command.mode.tobytes()) != self._mode or command.level != self._level:
             self._set_modes(command)
