@@ -6,16 +6,14 @@ from functools import partial
 
 from deal_hw.workflows.emulation.cartpole import emulate_cartpole
 from deal_hw.workflows.emulation.common import signalled
-from deal_hw.workflows.emulation.g1 import emulate_g1
 from deal_hw.workflows.emulation.go2 import emulate_go2
-from deal_hw.workflows.emulation.h1 import emulate_h1
+from deal_hw.workflows.emulation.hung import emulate_hung
 from deal_hw.workflows.emulation.plug_in import emulate_plug_in
 from deal_hw.workflows.emulation.settings import (
     EMULATE,
     EmulateCartpoleSettings,
-    EmulateG1Settings,
     EmulateGo2Settings,
-    EmulateH1Settings,
+    EmulateHungSettings,
     EmulatePlugInSettings,
     EmulateSettings,
 )
@@ -33,10 +31,8 @@ def emulate(config: EmulateSettings) -> int:
     with signalled() as (stop, cut):
         if isinstance(config, EmulateGo2Settings):
             emulate_go2(config, stop, cut, announce=announce, say=to_stderr)
-        elif isinstance(config, EmulateG1Settings):
-            emulate_g1(config, stop, cut, announce=announce, say=to_stderr)
-        elif isinstance(config, EmulateH1Settings):
-            emulate_h1(config, stop, cut, announce=announce, say=to_stderr)
+        elif isinstance(config, EmulateHungSettings):
+            emulate_hung(config, stop, cut, announce=announce, say=to_stderr)
         elif isinstance(config, EmulateCartpoleSettings):
             emulate_cartpole(config, stop, cut, announce=announce, say=to_stderr)
         elif isinstance(config, EmulatePlugInSettings):

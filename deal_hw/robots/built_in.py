@@ -177,6 +177,7 @@ G1: Final = RobotEntry(
     wires=_unitree_wires(*_OF_G1),
     recorded="deal_hw.drivers.g1.description:DESCRIPTION",
     spaces="deal_hw.drivers.g1.description:SPACES",
+    truth="deal_hw.drivers.g1.emulator.truth:G1Truth",
     motors="deal_hw.drivers.g1.joints:JOINTS_29",
 )
 G1_23DOF: Final = RobotEntry(
@@ -187,6 +188,7 @@ G1_23DOF: Final = RobotEntry(
     recorded="deal_hw.drivers.g1.description:DESCRIPTION_23",
     spaces="deal_hw.drivers.g1.description:SPACES_23",
     machine="g1",
+    truth="deal_hw.drivers.g1.emulator.truth:G1Truth",
     motors="deal_hw.drivers.g1.joints:JOINTS_23",
 )
 H1: Final = RobotEntry(
@@ -196,6 +198,7 @@ H1: Final = RobotEntry(
     wires=_unitree_wires(*_OF_H1),
     recorded="deal_hw.drivers.h1.description:DESCRIPTION",
     spaces="deal_hw.drivers.h1.description:SPACES",
+    truth="deal_hw.drivers.h1.emulator:H1Truth",
     motors="deal_hw.drivers.h1.joints:MOTORS",
 )
 ALLEGRO: Final = RobotEntry(

@@ -129,7 +129,7 @@ class RobotEntry:
         tasks: Further training tasks, as ``task``, by name.
         policies: Further shipped policies, as ``policy``: those of these tasks by their names, and others.
         truth: The class of the hidden parameters of its emulator, where that also emulates other robots: a
-            :class:`~deal_hw.drivers.unitree.emulated_quadruped.QuadrupedTruth`.
+            :class:`~deal_hw.drivers.unitree.emulated_truth.JointTruth`.
         motors: The joints in the order of the vendor's motor numbers, by which policies of other trainers
             name them.
         needs: What pip installs for it; named where an import fails.

@@ -7,7 +7,6 @@ battery and temperatures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -62,9 +61,6 @@ class H1Truth(HumanoidTruth):
 class H1Device(HungDevice[GoCommand]):
     """An emulated H1 without real time and wire; its pelvis is held in the air, its inertial sensor turns.
 
-    Attributes:
-        types: No topic has another type than usual.
-
     Args:
         truth: Hidden parameters, profile, seed.
         controller: Mode of the robot's own controller at power-up; "" for none.
@@ -72,8 +68,6 @@ class H1Device(HungDevice[GoCommand]):
         plan: Faults to make.
         tick_ms: The robot's clock at the beginning.
     """
-
-    types: Mapping[str, str] = {}
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, TypeVar
 
@@ -67,6 +68,7 @@ class HungDevice(UnitreeDevice[CommandT]):
 
     Attributes:
         published: Topics that it writes.
+        types: Types of the topics that have another type than the Go2's.
 
     Args:
         truth: Hidden parameters, profile, seed.
@@ -80,6 +82,7 @@ class HungDevice(UnitreeDevice[CommandT]):
     """
 
     published: tuple[str, ...] = PUBLISHED
+    types: Mapping[str, str] = {}
     own_period_ms: ClassVar[int] = PERIOD_MS
 
     def __init__(

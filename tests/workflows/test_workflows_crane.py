@@ -14,7 +14,7 @@ from deal_hw.errors import ConfigurationError, SafetyError
 from deal_hw.robots.connect import make_robot
 from deal_hw.workflows.collect import collect
 from deal_hw.workflows.deploy import deploy
-from deal_hw.workflows.emulation.g1 import emulate_g1
+from deal_hw.workflows.emulation.hung import emulate_hung
 from deal_hw.workflows.emulation.settings import EmulateG1Settings
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.settings import CraneOptions
@@ -91,4 +91,4 @@ def test_a_truth_of_the_other_version_is_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps(nominal_truth().to_json()), encoding="utf-8")
     settings = EmulateG1Settings("g1_23dof", truth_from=path)
     with pytest.raises(ConfigurationError, match=r"truth of a g1, not of a g1_23dof"):
-        emulate_g1(settings, threading.Event(), threading.Event(), announce=silent, say=silent)
+        emulate_hung(settings, threading.Event(), threading.Event(), announce=silent, say=silent)

@@ -33,23 +33,14 @@ TRACK_NS = 10_000_000
 def emulate_go2(
     config: EmulateGo2Settings, stop: threading.Event, cut: threading.Event, *, announce: Say, say: Say
 ) -> None:
-    """Run the emulator until a stop or the given time.
-
-    Args:
-        config: What to emulate.
-        stop: Ends it.
-        cut: Cuts the wire.
-        announce: Called with the port first, and with the truth at the end.
-        say: Called with a summary at the end.
-    """
+    """Run the emulator until a stop or the given time; arguments as for :func:`emulate_on_topics`."""
     truth = _truth(config)
-    what = f"profile {truth.profile}, seed {truth.seed}"
 
     def watch(device: Go2Device) -> AbstractContextManager[Callable[[], None]]:
         return tracking(config.go2.track_to, device, config.go2.tick_start_ms)
 
     emulate_on_topics(
-        config, lambda: _device(config, truth), what, stop, cut, announce=announce, say=say, watch=watch
+        config, truth, lambda: _device(config, truth), stop, cut, announce=announce, say=say, watch=watch
     )
 
 

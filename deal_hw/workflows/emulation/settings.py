@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +12,7 @@ from deal_hw.drivers.g1.emulator.faults import G1Faults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.drivers.h1.faults import H1Faults
 from deal_hw.drivers.servo_arm.faults import ArmFaults
+from deal_hw.drivers.unitree.hung_faults import HungFaults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
 from deal_hw.robots import driven_entry, emulated_robots, has_hardware, robot_entry
@@ -250,8 +252,8 @@ class EmulateArmSettings(EmulatePlugInSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EmulateGo2Settings(EmulateSettings):
-    """Emulate a Go2 in real time on its own network, with hidden physics."""
+class EmulateOnTopicsSettings(EmulateSettings):
+    """Emulate a robot in real time on its own network, with hidden physics."""
 
     transport: Literal["dds", "zenoh"] = "dds"
     """The wire."""
@@ -260,11 +262,16 @@ class EmulateGo2Settings(EmulateSettings):
     """Network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one). By
     default reachable on this machine only."""
 
-    go2: Go2Options = field(default_factory=Go2Options)
-    """Options of a robot with four legs."""
-
     wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
     """How it joins its network."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateGo2Settings(EmulateOnTopicsSettings):
+    """Emulate a Go2 in real time on its own network, with hidden physics."""
+
+    go2: Go2Options = field(default_factory=Go2Options)
+    """Options of a robot with four legs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,76 +280,75 @@ class EmulateB2Settings(EmulateGo2Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class G1Options(Checked):
-    """Options of ``emulate g1`` alone."""
+class HungOptions(Checked):
+    """Options of an emulated humanoid that hangs on a crane."""
 
     controller: Literal["ai", "normal", "advanced", "off"] = "ai"
     """Mode of the robot's own controller at power-up. It overrides other commands until it is released."""
-
-    mode_machine: Annotated[int | None, Range(0, 255)] = None
-    """Version of the G1 that the states report; by default 5 (29 joints) or 4 (23 joints)."""
 
     no_remote: bool = False
     """Emulate no remote: its 40 bytes are zeros."""
 
     tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
     """The robot's clock at the start [ms]; it wraps at 2**32."""
+
+    faults: HungFaults
+    """Faults of the robot. Their times count from the first stiff command."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class G1Options(HungOptions):
+    """Options of ``emulate g1`` alone."""
+
+    mode_machine: Annotated[int | None, Range(0, 255)] = None
+    """Version of the G1 that the states report; by default 5 (29 joints) or 4 (23 joints)."""
 
     faults: G1Faults = field(default_factory=G1Faults)
     """Faults of the G1. Their times count from the first stiff command."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EmulateG1Settings(EmulateSettings):
-    """Emulate a G1 that hangs on a crane, in real time on its own network, with hidden physics."""
-
-    transport: Literal["dds", "zenoh"] = "dds"
-    """The wire."""
-
-    port: str | None = None
-    """Network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one). By
-    default reachable on this machine only."""
-
-    g1: G1Options = field(default_factory=G1Options)
-    """Options of the G1 alone."""
-
-    wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
-    """How it joins its network."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class H1Options(Checked):
+class H1Options(HungOptions):
     """Options of ``emulate h1`` alone."""
-
-    controller: Literal["ai", "normal", "advanced", "off"] = "ai"
-    """Mode of the robot's own controller at power-up. It overrides other commands until it is released."""
-
-    no_remote: bool = False
-    """Emulate no remote: its 40 bytes are zeros."""
-
-    tick_start_ms: Annotated[int, Range(0, 2**32 - 1, "ms")] = 0
-    """The robot's clock at the start [ms]; it wraps at 2**32."""
 
     faults: H1Faults = field(default_factory=H1Faults)
     """Faults of the H1. Their times count from the first stiff command."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EmulateH1Settings(EmulateSettings):
+class EmulateHungSettings(EmulateOnTopicsSettings, abc.ABC):
+    """Emulate a humanoid that hangs on a crane, in real time on its own network, with hidden physics."""
+
+    @property
+    @abc.abstractmethod
+    def own(self) -> HungOptions:
+        """The options of this robot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateG1Settings(EmulateHungSettings):
+    """Emulate a G1 that hangs on a crane, in real time on its own network, with hidden physics."""
+
+    g1: G1Options = field(default_factory=G1Options)
+    """Options of the G1 alone."""
+
+    @property
+    def own(self) -> G1Options:
+        """The options of this robot."""
+        return self.g1
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmulateH1Settings(EmulateHungSettings):
     """Emulate an H1 that hangs on a crane, in real time on its own network, with hidden physics."""
-
-    transport: Literal["dds", "zenoh"] = "dds"
-    """The wire."""
-
-    port: str | None = None
-    """Network interface or its address (dds), or end point to listen at (zenoh; port 0: any free one). By
-    default reachable on this machine only."""
 
     h1: H1Options = field(default_factory=H1Options)
     """Options of the H1 alone."""
 
-    wire: EmulatorWireOptions = field(default_factory=EmulatorWireOptions)
-    """How it joins its network."""
+    @property
+    def own(self) -> H1Options:
+        """The options of this robot."""
+        return self.h1
 
 
 _SETTINGS: dict[str, type[EmulateSettings]] = {

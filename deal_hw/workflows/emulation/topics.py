@@ -9,7 +9,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.unitree.emulator import DeviceOnTopics
@@ -17,22 +17,20 @@ from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.robots import robot_entry
 from deal_hw.robots.connect import make_topic_transport
 from deal_hw.workflows.emulation.common import happenings, next_line, realtime_priority, reveal, run_until
-from deal_hw.workflows.emulation.settings import (
-    EmulateG1Settings,
-    EmulateGo2Settings,
-    EmulateH1Settings,
-    EmulateSettings,
-)
+from deal_hw.workflows.emulation.settings import EmulateOnTopicsSettings, EmulateSettings
 from deal_hw.workflows.say import Say, silent
+
+if TYPE_CHECKING:
+    from deal_hw.drivers.unitree.emulated_truth import JointTruth
 
 D = TypeVar("D", bound=DeviceOnTopics)
 _ANY_PORT = re.compile(r"(?P<host>.*/\[?(?P<address>[^\]]*)\]?):0")
 
 
 def emulate_on_topics(
-    config: EmulateGo2Settings | EmulateG1Settings | EmulateH1Settings,
+    config: EmulateOnTopicsSettings,
+    truth: JointTruth,
     make: Callable[[], D],
-    what: str,
     stop: threading.Event,
     cut: threading.Event,
     *,
@@ -44,8 +42,8 @@ def emulate_on_topics(
 
     Args:
         config: What to emulate.
+        truth: The robot's hidden parameters.
         make: Makes the device.
-        what: Profile and seed, for the second line.
         stop: Ends it.
         cut: Cuts the wire.
         announce: Called with the port first, and with the truth at the end.
@@ -71,7 +69,7 @@ def emulate_on_topics(
         try:
             emulator.open()
             announce(f"port {port}")
-            announce(f"{what}, on {transport}; Ctrl-C ends")
+            announce(f"profile {truth.profile}, seed {truth.seed}, on {transport}; Ctrl-C ends")
             announce(next_line(config, port))
 
             log = device.log
