@@ -1,4 +1,4 @@
-"""The Go2's climb: walk ahead onto a platform whose height and distance are told, or not."""
+"""The Go2's climb: walk ahead onto a platform, steps or a slope; what is ahead is told, or not."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final, get_args
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from deal_hw.policies.vector_env import Extrinsics, check_task
 from deal_hw.policy import CLIMBED, OBSTACLE_AXES, ObservationTerm, PolicySpec
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
-from deal_hw.sim.legged.terrain import EDGE_M, BatchPlatforms, Terrain, terrain_geoms, with_terrain
+from deal_hw.sim.legged.terrain import EDGE_M, BatchTerrain, Kind, Terrain, terrain_geoms, with_terrain
 from deal_hw.types import FloatArray
 
 AHEAD_M: Final = tuple(np.linspace(-0.4, 1.0, 15).tolist())
@@ -46,17 +46,23 @@ class ClimbTask(WalkTask):
     """Settings of the climb, those of the walk with other values.
 
     Attributes:
+        terrains: Kinds of terrain; each robot is given one of them with equal chance.
         rise_m: Height of the platform at the lowest and the highest level.
+        step_m: The same of one step.
+        slope_rad: The same of the angle of a slope.
         levels: Number of levels. A robot that climbed goes up one; one that fell, or was to walk ``TRIED_M``
             beyond the edge and did not climb, goes down one; after the highest one is drawn among all.
-        distance_m: Lowest and highest distance of the platform from the start.
-        flat: Share of episodes without a platform.
+        distance_m: Lowest and highest distance of the terrain from the start.
+        flat: Share of episodes without terrain.
         blind: Share of episodes in which nothing is told of the platform.
         top_weight: Reward of feet on the platform, mean over the feet.
     """
 
     ticks: int = 300
+    terrains: tuple[Kind, ...] = ("box",)
     rise_m: tuple[float, float] = (0.04, 0.22)
+    step_m: tuple[float, float] = (0.03, 0.15)
+    slope_rad: tuple[float, float] = (0.05, 0.4)
     levels: int = 10
     distance_m: tuple[float, float] = (0.6, 1.2)
     flat: float = 0.1
@@ -75,25 +81,31 @@ class ClimbTask(WalkTask):
         for name in ("flat", "blind"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must lie in [0, 1], got {getattr(self, name)!r}")
-        for name in ("rise_m", "distance_m"):
+        if not self.terrains or len(set(self.terrains)) < len(self.terrains):
+            raise ConfigurationError(f"terrains must be different kinds, at least one, got {self.terrains}")
+        for name in ("rise_m", "step_m", "slope_rad", "distance_m"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise ConfigurationError(f"{name} must be (low, high) with 0 < low <= high, got {low, high}")
 
+    def ends_of(self, kind: Kind) -> tuple[float, float]:
+        """Return the rise of a kind at the lowest and the highest level [m or rad]."""
+        return {"box": self.rise_m, "steps": self.step_m, "slope": self.slope_rad}[kind]
+
 
 class ClimbEnv(Go2Env):
-    """Follow a velocity ahead onto a platform, behind the safety filter.
+    """Follow a velocity ahead onto what lies there, behind the safety filter.
 
     The reward of a tick is that of the walk (:class:`~deal_hw.policies.go2_env.Go2Env`), where heights are
-    over the ground below. Within ``FREE_M`` before the edge a step is to be higher by the platform's height.
-    Robots that are told nothing cannot know it: no height is wanted of their feet within ``FREE_M`` of the
+    over the ground below. Within ``FREE_M`` before an edge a foot is to be lifted higher by its height.
+    Robots that are told nothing cannot know it: no height is wanted of their feet within ``FREE_M`` of an
     edge. And::
 
-        top_weight share of the feet that are over the platform and higher than it
+        top_weight share of the feet that are over the terrain and not below its surface
 
     The observation is the walk's, and what the operator says of the platform: its distance, less the
-    commanded way since then, and its height; both are zero where nothing is told. Height samples ahead are
-    for the critic alone.
+    commanded way since then, and its height (of steps that of one); both are zero where nothing is told, as
+    of slopes. Height samples ahead are for the critic alone.
 
     Args:
         description: The robot's description of its driver: with feet, and with limits for legs.
@@ -111,6 +123,7 @@ class ClimbEnv(Go2Env):
     """
 
     task: ClimbTask
+    task_of: ClassVar[type[ClimbTask]] = ClimbTask
 
     def __init__(
         self,
@@ -122,9 +135,10 @@ class ClimbEnv(Go2Env):
         threads: int | None = 1,
         engine: EngineName = "mujoco",
     ) -> None:
-        task = task or ClimbTask()
-        self._nominal = Terrain(kind="box", rise=task.rise_m[0], distance_m=max(task.distance_m[0], 0.5))
-        self._platforms: BatchPlatforms | None = None
+        task = task or self.task_of()
+        at = max(task.distance_m[0], 0.5)
+        self._nominal = [Terrain(kind=k, rise=task.ends_of(k)[0], distance_m=at) for k in task.terrains]
+        self._terrain: BatchTerrain | None = None
         self.level = np.zeros(count, dtype=np.int64)
         self._climbed: BoolArray = np.zeros(count, dtype=bool)
         self._told: BoolArray = np.zeros(count, dtype=bool)
@@ -132,7 +146,7 @@ class ClimbEnv(Go2Env):
         self._way = np.zeros(count)
         self._outcome = np.full(count, np.nan)
         super().__init__(description, distribution, count, task=task, threads=threads, engine=engine)
-        self._platforms = BatchPlatforms(self.loop.batch, self._nominal)
+        self._terrain = BatchTerrain(self.loop.batch, task.terrains)
 
     @staticmethod
     def spec_of(description: RobotDescription, trained_under: str, task: WalkTask) -> PolicySpec:
@@ -142,17 +156,17 @@ class ClimbEnv(Go2Env):
         return dataclasses.replace(walk, observation=walk.observation + told)
 
     @property
-    def platforms(self) -> BatchPlatforms:
-        """The members' platforms."""
-        assert self._platforms is not None
-        return self._platforms
+    def terrain(self) -> BatchTerrain:
+        """The members' terrains."""
+        assert self._terrain is not None
+        return self._terrain
 
     def scene(self, robot: RobotModel) -> RobotModel:
-        """Return the robot with a platform ahead."""
-        return with_terrain(robot, self._nominal)
+        """Return the robot with a terrain of each kind ahead."""
+        return with_terrain(robot, *self._nominal)
 
     def surroundings(self) -> Sequence[Parameter]:
-        """Return the walk's parameters; the floor's friction is the platform's, too."""
+        """Return the walk's parameters; the floor's friction is the terrain's, too."""
         model = self.scene(load_model(self.description)).model
         names = tuple(str(model.geom(k).name) for k in terrain_geoms(model))
         return [
@@ -161,57 +175,63 @@ class ClimbEnv(Go2Env):
         ]
 
     def begin_episodes(self, where: BoolArray, rng: np.random.Generator) -> None:
-        """Set the levels and the platforms of the restarted members, and tell some of them."""
+        """Set the levels and the terrain of the restarted members, and tell some of them."""
         super().begin_episodes(where, rng)
         task, members = self.task, np.flatnonzero(where)
         fell = (self._elapsed[members] > 0) & (self._elapsed[members] < task.ticks)
-        tried = fell | (self._way[members] > self.platforms.distance[members] + TRIED_M)
-        tried &= self.platforms.rise[members] > 0.0
-        for k in np.flatnonzero((tried | self._climbed[members]) & self._told[members]):
+        tried = fell | (self._way[members] > self.terrain.top_begins()[members] + TRIED_M)
+        tried &= self.terrain.rise[members] > 0.0
+        platform = np.array([kind == "box" for kind in task.terrains])
+        for k in np.flatnonzero(
+            (tried | self._climbed[members]) & self._told[members] & platform[self.terrain.kind[members]]
+        ):
             self._tries[self.level[members[k]]].append(bool(self._climbed[members[k]]))
         moved = self.level[members] + np.where(self._climbed[members], 1, np.where(tried, -1, 0))
         # One that is at the top begins anywhere: otherwise easy platforms would be forgotten.
         anywhere = rng.integers(task.levels, size=len(members))
         self.level[members] = np.where(moved >= task.levels, anywhere, np.maximum(moved, 0))
         self._climbed[members], self._way[members] = False, 0.0
-        low, high = task.rise_m
+        kind = np.zeros(len(members), dtype=np.int64)
+        if len(task.terrains) > 1:
+            kind = rng.integers(len(task.terrains), size=len(members))
+        low, high = np.array([task.ends_of(name) for name in task.terrains])[kind].T
         rise = low + (high - low) * self.level[members] / (task.levels - 1)
         rise[rng.random(len(members)) < task.flat] = 0.0
         distance = rng.uniform(*task.distance_m, len(members))
-        self.platforms.place(members, rise, distance)
-        told = (rng.random(len(members)) >= task.blind) & (rise > 0.0)
+        self.terrain.place(members, rise, distance, kind)
+        edges = np.array([name != "slope" for name in task.terrains])[kind]
+        told = (rng.random(len(members)) >= task.blind) & (rise > 0.0) & edges
         self._told[members] = told
         self._builder.obstacle[members] = np.where(told[:, None], np.column_stack([distance, rise]), 0.0)
 
     def base_height(self, position: FloatArray) -> FloatArray:
         """Return the heights of bases over the mean of the ground below them, (N,) [m]."""
-        if self._platforms is None:
+        if self._terrain is None:
             return super().base_height(position)
-        ground = self.platforms.height(position[:, :1] + np.array(FOOTPRINT_M)).mean(axis=1)
+        ground = self.terrain.height(position[:, :1] + np.array(FOOTPRINT_M)).mean(axis=1)
         return np.asarray(position[:, 2] - ground)
 
     def privileged(self) -> FloatArray:
         """Return the walk's information, and samples of the ground ahead over that below the base, (N, P)."""
         x = self.loop.position[:, :1]
-        ground = self.platforms.height(x + np.array(AHEAD_M)) - self.platforms.height(x)
+        ground = self.terrain.height(x + np.array(AHEAD_M)) - self.terrain.height(x)
         return np.hstack([super().privileged(), 4.0 * ground])
 
     def extrinsics(self) -> Extrinsics:
         """Return what is known of the robots, and the ground below each foot and just ahead of it."""
         feet, base = np.asarray(self._places[:, self._feet])[..., 0], self.loop.position[:, :1]
-        here = self.platforms.height(base)
-        ground = np.hstack([self.platforms.height(feet + ahead) - here for ahead in FELT_AHEAD_M])
+        here = self.terrain.height(base)
+        ground = np.hstack([self.terrain.height(feet + ahead) - here for ahead in FELT_AHEAD_M])
         # Feet are known one step after a state is set, and a robot starts on the floor.
         ground[self._elapsed == 0] = 0.0
         names = [f"{foot}.ground+{ahead:g}m" for ahead in FELT_AHEAD_M for foot in self.description.feet]
         return super().extrinsics().and_more(names, GROUND_M, ground)
 
     def on_top(self) -> BoolArray:
-        """Return which feet are over the platform and not below its top, (N, F)."""
+        """Return which feet are over the terrain and not below its surface, (N, F)."""
         feet = np.asarray(self._places[:, self._feet])
-        rise = self.platforms.rise[:, None]
-        over = self.platforms.height(feet[..., 0]) > 0.0
-        return np.asarray(over & (feet[..., 2] - self._radius > rise - EDGE_M))
+        ground = self.terrain.height(feet[..., 0])
+        return np.asarray((ground > 0.0) & (feet[..., 2] - self._radius > ground - EDGE_M))
 
     def reward(
         self, position: FloatArray, velocity: FloatArray, action: FloatArray, before: FloatArray
@@ -220,9 +240,10 @@ class ClimbEnv(Go2Env):
         reward = super().reward(position, velocity, action, before)
         self._way += self.command[:, 0] / self.description.control_rate_hz
         top = self.on_top()
-        self._climbed |= top.all(axis=1)
+        behind = np.asarray(self._places[:, self._feet, 0]) >= self.terrain.top_begins()[:, None]
+        self._climbed |= (top & behind).all(axis=1)
         # Members that end are restarted before somebody asks.
-        self._outcome = np.where(self.platforms.rise > 0.0, self._climbed, np.nan)
+        self._outcome = np.where(self.terrain.rise > 0.0, self._climbed, np.nan)
         self._note(level=self.level.mean(), on_top=top.mean())
         return np.asarray(reward + self.task.top_weight * top.mean(axis=1))
 
@@ -250,30 +271,43 @@ class ClimbEnv(Go2Env):
             mine.extend(bool(done) for done in found)
 
     def outcomes(self) -> Mapping[str, FloatArray]:
-        """Return whether all feet were on the platform at once; NaN without a platform."""
+        """Return whether all feet were on the (last) platform at once; NaN without terrain."""
         return {"climbed": self._outcome}
 
     def _feet_now(self) -> FloatArray:
         feet = super()._feet_now().copy()
-        feet[..., 2] -= self.platforms.height(feet[..., 0])
+        feet[..., 2] -= self.terrain.height(feet[..., 0])
         return feet
 
     def _lift(self) -> FloatArray:
         """Return how high each foot is to be lifted in the middle of a step, (N, F) [m].
 
-        Before the edge it is the walk's height over the platform.
+        Before an edge it is the walk's height over what lies behind it.
         """
-        ahead = self.platforms.distance[:, None] - np.asarray(self._places[:, self._feet])[..., 0]
-        before = (ahead > 0.0) & (ahead < FREE_M)
-        return np.where(before, self.platforms.rise[:, None], 0.0) + self.task.swing_m
+        before = self.terrain.to_edge(np.asarray(self._places[:, self._feet])[..., 0]) < FREE_M
+        return np.where(before, self.terrain.rise[:, None], 0.0) + self.task.swing_m
 
     def _foot_errors(self, error: FloatArray) -> FloatArray:
         return np.asarray(np.abs(error) / self._lift())
 
     def _wanted_heights(self) -> FloatArray:
         feet = np.asarray(self._places[:, self._feet])
-        off = np.abs(feet[..., 0] - self.platforms.distance[:, None])
         blind = self._builder.obstacle[:, 1] == 0.0
-        free = (off < FREE_M) & (blind & (self.platforms.rise > 0.0))[:, None]
+        near = self.terrain.from_edge(feet[..., 0]) < FREE_M
+        free = near & (blind & (self.terrain.rise > 0.0))[:, None]
         wanted = super()._wanted_heights() * self._lift() / self.task.swing_m
         return np.where(free, self._feet_now()[..., 2] - self._radius, wanted)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TerrainTask(ClimbTask):
+    """Settings of a walk over all kinds of terrain: time enough for a slope."""
+
+    ticks: int = 350
+    terrains: tuple[Kind, ...] = get_args(Kind)
+
+
+class TerrainEnv(ClimbEnv):
+    """Follow a velocity ahead over platforms, steps and slopes; see :class:`ClimbEnv`."""
+
+    task_of: ClassVar[type[ClimbTask]] = TerrainTask

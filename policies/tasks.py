@@ -167,6 +167,8 @@ CANTER: Final = _go2("canter_env:CanterEnv", ppo=_CANTER_PPO)
 """The Go2's canter; the shipped policy was trained in two stages, see docs/how-to/go2-gaits.md."""
 CLIMB: Final = _go2("climb_env:ClimbEnv", ppo=_CLIMB_PPO)
 """The Go2's climb onto a platform; the shipped policy had a third of these steps."""
+TERRAIN: Final = _go2("climb_env:TerrainEnv", ppo=_CLIMB_PPO)
+"""The Go2's walk over platforms, steps and slopes; no policy of it is shipped."""
 HUMANOID: Final = _simulated(
     "humanoid_env:HumanoidEnv", motors=21, udr_ratio=1.75, ppo=_STRIDE_PPO, members=128
 )

@@ -2,7 +2,8 @@
 
     MUJOCO_GL=osmesa python tools/draw_policy.py humanoid --out walk.png
     MUJOCO_GL=osmesa python tools/draw_policy.py allegro --policy FILE.onnx --out turn.gif
-    MUJOCO_GL=osmesa python tools/draw_policy.py go2-climb --height 0.15 --out climb.gif
+    MUJOCO_GL=osmesa python tools/draw_policy.py go2-climb --terrain box:0.15 --out climb.gif
+    MUJOCO_GL=osmesa python tools/draw_policy.py go2-climb --terrain slope:0.2 --out slope.gif
 
 The physics is drawn under uniform domain randomisation, as in training. Without a GPU: apt-get install
 libosmesa6. The hand's cube has a red arrow along its x axis; the green arrow beside it is the target's. The
@@ -172,13 +173,14 @@ def add_arrows(spec: Any, target: FloatArray) -> None:
         spec.worldbody.add_geom(size=[size, 0, 0], fromto=ends, rgba=[0, 0.6, 0.1, 1], **look)
 
 
-def environment(view: View, height: float) -> Any:
+def environment(view: View, terrain: Terrain) -> Any:
     """Return a robot in the environment of its task; a Go2 goes straight ahead, onto a platform [m]."""
     description, drawn = recorded_description(view.robot), udr_distribution(view.robot, view.task)
     if view.robot != "go2":
         return training_task(view.robot, view.task).make(description, drawn, 1)
     if view.task == "climb":
-        return ClimbEnv(description, drawn, 1, task=climb_task(height, blind=False))
+        task = climb_task(terrain.rise, blind=False, kind=terrain.kind)
+        return ClimbEnv(description, drawn, 1, task=task)
     kind, usual, speed = Go2Env, WalkTask(), WALK_M_S
     if view.task == "canter":
         kind, usual, speed = CanterEnv, CanterTask(), STRAIGHT_M_S
@@ -188,17 +190,17 @@ def environment(view: View, height: float) -> Any:
     )
 
 
-def episode(view: View, policy: OnnxPolicy, seed: int, seconds: float, height: float) -> Episode:
+def episode(view: View, policy: OnnxPolicy, seed: int, seconds: float, terrain: Terrain) -> Episode:
     """Run a policy in its environment."""
-    env = environment(view, height)
+    env = environment(view, terrain)
     env.observe_for(policy.spec)
     observation, _ = env.reset(seed=seed)
     shown: dict[str, Any] = {}
     if view.robot == "allegro":
         shown["target"] = env.wanted[0].copy()
     if isinstance(env, ClimbEnv):
-        at = env.platforms
-        shown["terrain"] = Terrain(kind="box", rise=float(at.rise[0]), distance_m=float(at.distance[0]))
+        at = env.terrain
+        shown["terrain"] = dataclasses.replace(terrain, distance_m=float(at.distance[0]))
     states, places = env.loop.batch.engine.bind("qpos"), []
     rate_hz = env.description.control_rate_hz
     for tick in range(min(env.ticks, round(seconds * rate_hz))):
@@ -239,13 +241,18 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, help="by default the shipped one")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--height", type=float, default=0.15, help="of the platform before go2-climb [m]")
+    parser.add_argument(
+        "--terrain",
+        type=Terrain.parse,
+        default="box:0.15",
+        help="before go2-climb, as for `deal-hw emulate go2`; its distance is drawn",
+    )
     parser.add_argument("--pictures", type=int, default=8, help="pictures of a strip")
     parser.add_argument("--out", type=Path, required=True, help="a .png strip or a .gif animation")
     args = parser.parse_args()
     view = VIEWS[args.robot]
     policy = OnnxPolicy(args.policy or ASSETS / f"{view.file}.onnx")
-    shown = episode(view, policy, args.seed, args.seconds, args.height)
+    shown = episode(view, policy, args.seed, args.seconds, args.terrain)
     places = shown.places
     if args.out.suffix == ".gif":
         chosen = places[:: round(50.0 / ANIMATED_HZ)]

@@ -21,7 +21,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.climb_env import ClimbEnv, ClimbTask
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import recorded_description
-from deal_hw.sim.legged.terrain import Scuffs
+from deal_hw.sim.legged.terrain import Kind, Scuffs, Terrain
 from deal_hw.workflows.emulation.virtual_go2 import walk
 from deal_hw.workflows.emulation.walk_script import WALKS, Walk, write_script
 
@@ -119,11 +119,15 @@ def score_climb(truth: Go2Truth, policy: OnnxPolicy, out: Path) -> dict[str, Any
     return found
 
 
-def climb_task(height: float, *, blind: bool) -> ClimbTask:
-    """Return a climb of one height [m] at one velocity, without pushes, told to all robots or to none."""
+def climb_task(rise: float, *, blind: bool, kind: Kind = "box") -> ClimbTask:
+    """Return a climb of one rise [m or rad] at one velocity, without pushes, told to all or to none."""
+    ends, run = (rise, rise), Terrain(kind=kind, rise=rise).top_begins_m
     return ClimbTask(
-        ticks=round(CLIMB_S * 50.0),
-        rise_m=(height, height),
+        ticks=round((CLIMB_S + run / CLIMB_M_S) * 50.0),
+        terrains=(kind,),
+        rise_m=ends,
+        step_m=ends,
+        slope_rad=ends,
         flat=0.0,
         blind=float(blind),
         command_range=((CLIMB_M_S, CLIMB_M_S), (0.0, 0.0), (0.0, 0.0)),
@@ -134,10 +138,10 @@ def climb_task(height: float, *, blind: bool) -> ClimbTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClimbTries:
-    """What became of tries to climb a platform.
+    """What became of tries to climb.
 
     Attributes:
-        climbed: Number of robots whose four feet were on the platform at once and that did not fall.
+        climbed: Number of robots whose four feet were on the (last) platform at once and that did not fall.
         fell: Number of robots that fell.
         scuffs: How often a leg or the trunk came to press against the platform's front, mean over the robots.
         torque_nm: Root mean square of the joints' torques until the robots ended.
@@ -150,19 +154,28 @@ class ClimbTries:
 
 
 def climbs(
-    policy: Any, distribution: ParameterDistribution, height: float, seed: int, tries: int, *, blind: bool
+    policy: Any,
+    distribution: ParameterDistribution,
+    rise: float,
+    seed: int,
+    tries: int,
+    *,
+    blind: bool,
+    kind: Kind = "box",
 ) -> ClimbTries:
     """Let robots climb in the batched environment, behind the safety filter of deploying.
 
     Args:
         policy: The policy; it need not observe the platform.
         distribution: Of the robots.
-        height: Of the platform [m].
+        rise: Height of the platform or of one step [m], or angle of the slope [rad].
         seed: Seeds the robots, their distances and the noise.
         tries: Number of robots.
         blind: Whether the robots are told nothing.
+        kind: Kind of the terrain.
     """
-    env = ClimbEnv(recorded_description("go2"), distribution, tries, task=climb_task(height, blind=blind))
+    task = climb_task(rise, blind=blind, kind=kind)
+    env = ClimbEnv(recorded_description("go2"), distribution, tries, task=task)
     env.observe_for(policy.spec)
     seen, _ = env.reset(seed=seed)
     going, climbed = np.ones(tries, dtype=bool), np.zeros(tries, dtype=bool)

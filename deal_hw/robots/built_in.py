@@ -130,7 +130,11 @@ GO2: Final = RobotEntry(
     task="deal_hw.policies.tasks:GO2",
     environment="deal_hw/Go2-v0",
     policy="deal_hw.policies:assets/go2_walk.onnx",
-    tasks={"canter": "deal_hw.policies.tasks:CANTER", "climb": "deal_hw.policies.tasks:CLIMB"},
+    tasks={
+        "canter": "deal_hw.policies.tasks:CANTER",
+        "climb": "deal_hw.policies.tasks:CLIMB",
+        "terrain": "deal_hw.policies.tasks:TERRAIN",
+    },
     policies={
         "canter": "deal_hw.policies:assets/go2_canter.onnx",
         "canter_amp": "deal_hw.policies:assets/go2_canter_amp.onnx",

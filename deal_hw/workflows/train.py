@@ -116,7 +116,7 @@ class TrainTaskSettings(TrainRobotSettings):
     """Train a policy under the calibrated distribution, or under uniform domain randomisation."""
 
     task: str = ""
-    """One of the robot's further tasks (go2: canter or climb); by default its usual one."""
+    """One of the robot's further tasks (go2: canter, climb or terrain); by default its usual one."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from deal_hw.policies.climb_env import ClimbEnv, ClimbTask
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policy import CLIMBED, ObservationBuilder, PolicySpec
 from deal_hw.robots import recorded_description, training_task
-from deal_hw.sim.legged.terrain import Scuffs, Terrain
+from deal_hw.sim.legged.terrain import Kind, Scuffs, Terrain
 from deal_hw.workflows.emulation import virtual_go2
 from deal_hw.workflows.running.plan import RunPlan, _ask_height, make_behaviour
 from deal_hw.workflows.running.view import RunView
@@ -47,12 +47,12 @@ def test_platforms_follow_the_levels_and_half_of_the_robots_are_told() -> None:
     env = make(200, flat=0.0, levels=10, rise_m=(0.04, 0.22))
     env.level[:] = np.arange(200) % 10
     seen, _ = env.reset(seed=0)
-    np.testing.assert_allclose(env.platforms.rise, 0.04 + 0.02 * (np.arange(200) % 10))
-    assert ((env.platforms.distance >= 0.6) & (env.platforms.distance <= 1.2)).all()
+    np.testing.assert_allclose(env.terrain.rise, 0.04 + 0.02 * (np.arange(200) % 10))
+    assert ((env.terrain.distance >= 0.6) & (env.terrain.distance <= 1.2)).all()
     told = seen[:, -1] > 0.0
     assert 0.35 < told.mean() < 0.65
-    np.testing.assert_allclose(seen[told, -1], env.platforms.rise[told], rtol=1e-6)
-    np.testing.assert_allclose(seen[told, -2], env.platforms.distance[told], rtol=1e-6)
+    np.testing.assert_allclose(seen[told, -1], env.terrain.rise[told], rtol=1e-6)
+    np.testing.assert_allclose(seen[told, -2], env.terrain.distance[told], rtol=1e-6)
     assert not seen[~told, -2:].any()
 
 
@@ -62,7 +62,7 @@ def test_a_leg_that_presses_against_the_front_scuffs() -> None:
     env.reset(seed=0)
     env.step(np.zeros((3, 12)))
     feet = np.asarray(env._places[:, env._feet[:2], 0]).max(axis=1)
-    env.platforms.place(np.arange(3), np.array([0.1, 0.1, 0.0]), feet + np.array([0.01, 0.3, 0.01]))
+    env.terrain.place(np.arange(3), np.array([0.1, 0.1, 0.0]), feet + np.array([0.01, 0.3, 0.01]))
     front = Scuffs(env.loop.batch)
     np.testing.assert_array_equal(front.now(np.arange(3)), [True, False, False])
     np.testing.assert_array_equal(front.now(np.array([2, 0])), [False, True])
@@ -91,7 +91,7 @@ def test_a_robot_that_climbs_goes_up_a_level_and_one_that_tried_goes_down() -> N
     env._way[:] = (0.0, 9.0, 9.0, 0.1, 9.0, 0.1)
     env._elapsed[:] = env.task.ticks
     env._elapsed[5] = 10
-    env.platforms.rise[4] = 0.0
+    env.terrain.rise[4] = 0.0
     env.level[2] = env.task.levels - 1
     env.begin_episodes(np.ones(6, dtype=bool), np.random.default_rng(1))
     np.testing.assert_array_equal(env.level[[0, 1, 3, 4, 5]], [5, 3, 4, 4, 3])
@@ -126,6 +126,48 @@ def test_a_robot_on_the_platform_is_as_high_as_one_on_the_floor() -> None:
             break
     assert truncated.all() and not env._climbed.any() and not env._way.any()
     np.testing.assert_array_equal(env.outcomes()["climbed"], [0.0, 1.0])
+
+
+def test_robots_get_different_terrain_and_nobody_tells_of_a_slope() -> None:
+    """Each kind has its own ends of the levels; of steps the height of one is told, of slopes nothing."""
+    kinds: tuple[Kind, ...] = ("box", "steps", "slope")
+    env = make(120, flat=0.0, blind=0.0, terrains=kinds, levels=2)
+    env.level[:] = np.arange(120) % 2
+    seen, _ = env.reset(seed=0)
+    assert np.bincount(env.terrain.kind).min() > 20
+    ends = np.array([env.task.ends_of(kind) for kind in kinds])
+    np.testing.assert_allclose(env.terrain.rise, ends[env.terrain.kind, env.level])
+    told = env.terrain.kind != kinds.index("slope")
+    np.testing.assert_allclose(seen[told, -1], env.terrain.rise[told], rtol=1e-6)
+    assert not seen[~told, -2:].any()
+
+
+def test_steps_and_slopes_are_climbed_at_their_ends() -> None:
+    """On the first step, and halfway up the ramp, feet are paid; only the platform behind counts."""
+    env = make(4, flat=0.0, terrains=("steps", "slope"), ticks=20, standing=0.0)
+    env.reset(seed=0)
+    members = np.arange(4)
+    kind, rise = np.array([0, 0, 1, 1]), np.array([0.1, 0.1, 0.1, 0.1])
+    env.terrain.place(members, rise, np.full(4, 0.6), kind)
+    position = env.loop.position.copy()
+    for member, ahead in enumerate((0.6 + 0.15, 2.5, 0.6 + 1.0, 4.0)):
+        position[member, 0] = ahead
+    ground = env.terrain.height(position[:, :1])[:, 0]
+    position[:, 2] += ground
+    position[2, 4] = -0.1
+    env.loop.batch.set_state(position, np.zeros((4, 18)))
+    for _ in range(5):
+        env.step(np.zeros((4, 12)))
+    assert env.on_top()[[1, 2, 3]].all() and env.on_top()[0].any()
+    np.testing.assert_array_equal(env.outcomes()["climbed"], [0.0, 1.0, 0.0, 1.0])
+    np.testing.assert_allclose(ground, [0.1, 0.3, np.tan(0.1), 1.5 * np.sin(0.1)])
+
+
+@pytest.mark.parametrize("terrains", [(), ("box", "box")])
+def test_kinds_of_terrain_are_different_ones(terrains: tuple[Kind, ...]) -> None:
+    """None, or one twice, is refused."""
+    with pytest.raises(ConfigurationError, match="different kinds"):
+        ClimbTask(terrains=terrains)
 
 
 def test_the_critic_alone_sees_the_ground() -> None:

@@ -71,7 +71,7 @@ def test_a_climb_also_knows_the_ground_below_and_just_ahead_of_the_feet() -> Non
     env.step(np.zeros((2, 12)))
     # A stance over the edge: the front feet are on the platform, the rear feet before it.
     front = float(np.mean(env._places[0, env._feet[:2], 0]))
-    env.platforms.place(np.arange(2), np.full(2, 0.1), np.full(2, front - 0.02))
+    env.terrain.place(np.arange(2), np.full(2, 0.1), np.full(2, front - 0.02))
     values = env.extrinsics().values[0, ground]
     np.testing.assert_allclose(values[:2], 0.1, atol=1e-6)
     np.testing.assert_allclose(values[2:4], 0.0, atol=1e-6)

@@ -1,8 +1,8 @@
-"""Simple terrain ahead of a robot with legs: a platform with a rounded edge, or a slope. No meshes.
+"""Simple terrain ahead of a robot with legs: a platform, three steps, or a slope. No meshes.
 
 The world's x axis is ahead; terrain reaches over the whole width of the robot's way. Feet and trunk touch it
 as they touch the floor, and so do hips, thighs and calves, which pass through the floor itself: a leg that
-hits a platform's edge must not pass through.
+hits a platform's edge must not pass through. Edges are round.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
@@ -25,11 +26,15 @@ if TYPE_CHECKING:
     # An emulated robot has terrain too, and no batch: loading that takes 0.3 s.
     from deal_hw.sim.engine.batch import ServoBatch
 
-Kind = Literal["box", "slope"]
+Kind = Literal["box", "steps", "slope"]
 
 LENGTH_M: Final = 4.0
-"""Length of a platform, and of the platform behind a slope."""
-RAMP_M: Final = 2.0
+"""Length of a platform, of steps in all, and of the platform behind a slope."""
+STEPS: Final = 3
+"""Number of steps; the last one is the platform."""
+TREAD_M: Final = 0.3
+"""Depth of a step, as of usual stairs."""
+RAMP_M: Final = 1.5
 """Length of a slope along its surface."""
 WIDTH_M: Final = 4.0
 EDGE_M: Final = 0.015
@@ -38,10 +43,12 @@ DEPTH_M: Final = 0.5
 """Height of the boxes, most of which is below the floor."""
 DISTANCE_M: Final = 1.0
 """Default distance of the terrain from the robot's start."""
+LEAST_RISE: Final = 0.01
+"""Rise of terrain that lies below the floor [m or rad]."""
 PREFIX: Final = "terrain"
 _LEG: Final = 2
 """Collision bit of legs on terrain; the floor does not have it."""
-_RANGE: Final = {"box": (0.0, 0.5, "m"), "slope": (0.0, 0.6, "rad")}
+_RANGE: Final = {"box": (0.0, 0.5, "m"), "steps": (0.0, 0.25, "m"), "slope": (0.0, 0.6, "rad")}
 _DISTANCE: Final = (0.5, 10.0)
 
 
@@ -50,8 +57,8 @@ class Terrain:
     """Terrain ahead of a robot that starts at the origin.
 
     Attributes:
-        kind: ``box``, a platform, or ``slope``, a ramp with a platform behind it.
-        rise: Height of the platform [m], or angle of the slope [rad].
+        kind: ``box``, a platform; ``steps``, three steps; or ``slope``, a ramp with a platform behind it.
+        rise: Height of the platform or of one step [m], or angle of the slope [rad].
         distance_m: Where it begins, along x.
     """
 
@@ -62,7 +69,7 @@ class Terrain:
     def __post_init__(self) -> None:
         if self.kind not in get_args(Kind):
             raise ConfigurationError(
-                f"terrain {shown(self.kind)}: there is {' and '.join(get_args(Kind))}; give such as box:0.2"
+                f"terrain {shown(self.kind)}: there are {', '.join(get_args(Kind))}; give such as box:0.2"
             )
         low, high, unit = _RANGE[self.kind]
         if not low < self.rise <= high:
@@ -91,24 +98,107 @@ class Terrain:
             values = []
         if not 1 <= len(values) <= 2 or not all(map(math.isfinite, values)):
             raise ConfigurationError(
-                f"terrain {shown(text)}: give box:HEIGHT [m] or slope:ANGLE [rad], with its distance after a "
-                f"comma [m] ({DISTANCE_M:g} by default), such as box:0.2,1.5"
+                f"terrain {shown(text)}: give box:HEIGHT [m], steps:HEIGHT of one step [m] or slope:ANGLE "
+                f"[rad], with its distance after a comma [m] ({DISTANCE_M:g} by default), such as box:0.2,1.5"
             )
         return cls(kind=kind, rise=values[0], distance_m=[*values, DISTANCE_M][1])  # type: ignore[arg-type]
 
     @property
     def top_m(self) -> float:
         """Height of its platform [m]."""
-        return self.rise if self.kind == "box" else RAMP_M * math.sin(self.rise)
+        return float(_top(self.kind, np.array(self.rise)))
+
+    @property
+    def top_begins_m(self) -> float:
+        """Where its platform begins, from its own beginning along x [m]."""
+        return float(_top_begins(self.kind, np.array(self.rise)))
 
     def height(self, x: FloatArray) -> FloatArray:
         """Return the height of the ground at places along x, (...,) [m]."""
-        ahead = np.asarray(x) - self.distance_m
-        run = 0.0 if self.kind == "box" else RAMP_M * math.cos(self.rise)
-        if self.kind == "box":
-            return np.where((ahead >= 0.0) & (ahead <= LENGTH_M), self.rise, 0.0)
-        ramp = np.clip(ahead * math.tan(self.rise), 0.0, self.top_m)
-        return np.where(ahead <= run + LENGTH_M, ramp, 0.0)
+        return _height(self.kind, np.array(self.rise), np.asarray(x) - self.distance_m)
+
+
+def _edges(kind: Kind) -> FloatArray:
+    """Return where a terrain rises at once, from its beginning along x, (E,) [m]; a slope does nowhere."""
+    return np.array([number * TREAD_M for number in range({"box": 1, "steps": STEPS, "slope": 0}[kind])])
+
+
+def _top(kind: Kind, rise: FloatArray) -> FloatArray:
+    """Return the heights of the last platform, (...,) [m]."""
+    if kind == "slope":
+        return np.asarray(RAMP_M * np.sin(rise))
+    return rise * len(_edges(kind))
+
+
+def _top_begins(kind: Kind, rise: FloatArray) -> FloatArray:
+    """Return where the last platform begins, from the terrain's beginning along x, (...,) [m]."""
+    if kind == "slope":
+        return np.asarray(RAMP_M * np.cos(rise))
+    return np.full(np.shape(rise), _edges(kind)[-1])
+
+
+def _height(kind: Kind, rise: FloatArray, ahead: FloatArray) -> FloatArray:
+    """Return the height of the ground [m] at places from the terrain's beginning along x; both (...,)."""
+    if kind == "slope":
+        ground = np.clip(ahead * np.tan(rise), 0.0, _top(kind, rise))
+        return np.where(ahead <= _top_begins(kind, rise) + LENGTH_M, ground, 0.0)
+    risen = sum((np.asarray(ahead) >= edge).astype(int) for edge in _edges(kind))
+    return np.where(ahead <= LENGTH_M, risen * rise, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Geoms:
+    """Boxes and rounded edges of one kind of terrain, for M rises and distances.
+
+    Attributes:
+        names: Their names, G.
+        sizes: Half lengths of a box, or radius and half length of an edge, (G, 3) [m].
+        position: (M, G, 3) [m].
+        quaternion: (M, G, 4).
+    """
+
+    names: tuple[str, ...]
+    sizes: FloatArray
+    position: FloatArray
+    quaternion: FloatArray
+
+
+def _geoms(kind: Kind, rise: FloatArray, distance: FloatArray) -> _Geoms:
+    """Return where the geoms of M terrains of one kind lie; rise and distance are (M,).
+
+    The face of a step ends below its edge, and its top begins behind it: the capsule is the corner between
+    them.
+    """
+    half, zero = 0.5 * DEPTH_M, np.zeros(len(rise))
+    names, sizes, position, quaternion = [], [], [], []
+
+    def add(
+        name: str, size: tuple[float, ...], place: tuple[FloatArray, ...], turn: FloatArray, axis: int
+    ) -> None:
+        names.append(f"{PREFIX}_{kind}_{name}")
+        sizes.append(size)
+        position.append(np.stack(place, axis=1))
+        turned = np.zeros((len(rise), 4))
+        turned[:, 0], turned[:, axis] = np.cos(0.5 * turn), np.sin(0.5 * turn)
+        quaternion.append(turned)
+
+    def box(name: str, begin: FloatArray, length: float, top: FloatArray) -> None:
+        place = (distance + begin + 0.5 * length, zero, top - half)
+        add(name, (0.5 * length, 0.5 * WIDTH_M, half), place, zero, 2)
+
+    top = _top(kind, rise)
+    if kind == "slope":
+        run = _top_begins(kind, rise)
+        middle = (distance + 0.5 * run + half * np.sin(rise), zero, 0.5 * top - half * np.cos(rise))
+        add("ramp", (0.5 * RAMP_M, 0.5 * WIDTH_M, half), middle, -rise, 2)
+        box("top", run, LENGTH_M, top)
+    for number, edge in enumerate(_edges(kind), 1):
+        step, length = number * rise, LENGTH_M - edge
+        box(f"face_{number}", zero + edge, length, step - EDGE_M)
+        box(f"top_{number}", zero + edge + EDGE_M, length - EDGE_M, step)
+        corner = (distance + edge + EDGE_M, zero, step - EDGE_M)
+        add(f"edge_{number}", (EDGE_M, 0.5 * WIDTH_M, 0.0), corner, zero + 0.5 * np.pi, 1)
+    return _Geoms(tuple(names), np.array(sizes), np.stack(position, axis=1), np.stack(quaternion, axis=1))
 
 
 def add_terrain(spec: Any, terrain: Terrain, floor: str = "floor") -> None:
@@ -123,53 +213,25 @@ def add_terrain(spec: Any, terrain: Terrain, floor: str = "floor") -> None:
     for geom in spec.geoms:
         if geom.name != floor and geom.contype == 0 and geom.parent is not spec.worldbody:
             geom.contype = _LEG
-    surface: dict[str, Any] = {
-        "contype": 0,
-        "conaffinity": ground.conaffinity | _LEG,
-        "condim": ground.condim,
-        "priority": ground.priority,
-        "friction": ground.friction,
-        "solref": ground.solref,
-        "solimp": ground.solimp,
-        "rgba": [0.55, 0.5, 0.42, 1.0],
-    }
-    begin, half = terrain.distance_m, 0.5 * DEPTH_M
-
-    def box(name: str, start: float, length: float, top: float) -> None:
+    geoms = _geoms(terrain.kind, np.array([terrain.rise]), np.array([terrain.distance_m]))
+    for name, size, place, turn in zip(
+        geoms.names, geoms.sizes, geoms.position[0], geoms.quaternion[0], strict=True
+    ):
         spec.worldbody.add_geom(
-            name=f"{PREFIX}_{name}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[0.5 * length, 0.5 * WIDTH_M, half],
-            pos=[start + 0.5 * length, 0.0, top - half],
-            **surface,
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_BOX if size[2] > 0.0 else mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=size,
+            pos=place,
+            quat=turn,
+            contype=0,
+            conaffinity=ground.conaffinity | _LEG,
+            condim=ground.condim,
+            priority=ground.priority,
+            friction=ground.friction,
+            solref=ground.solref,
+            solimp=ground.solimp,
+            rgba=[0.55, 0.5, 0.42, 1.0],
         )
-
-    if terrain.kind == "slope":
-        lean, run = terrain.rise, RAMP_M * math.cos(terrain.rise)
-        middle = begin + 0.5 * run + half * math.sin(lean)
-        spec.worldbody.add_geom(
-            name=f"{PREFIX}_ramp",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[0.5 * RAMP_M, 0.5 * WIDTH_M, half],
-            pos=[middle, 0.0, 0.5 * terrain.top_m - half * math.cos(lean)],
-            quat=[math.cos(0.5 * lean), 0.0, -math.sin(0.5 * lean), 0.0],
-            **surface,
-        )
-        box("top", begin + run, LENGTH_M, terrain.top_m)
-        return
-    # The face ends below the edge, and the top begins behind it: the capsule is the corner between them.
-    box("face", begin, LENGTH_M, terrain.rise - EDGE_M)
-    box("top", begin + EDGE_M, LENGTH_M - EDGE_M, terrain.rise)
-    spec.worldbody.add_geom(
-        name=f"{PREFIX}_edge",
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=[EDGE_M, 0.0, 0.0],
-        fromto=[
-            *(begin + EDGE_M, -0.5 * WIDTH_M, terrain.rise - EDGE_M),
-            *(begin + EDGE_M, 0.5 * WIDTH_M, terrain.rise - EDGE_M),
-        ],
-        **surface,
-    )
 
 
 def terrain_geoms(model: Any) -> list[int]:
@@ -177,65 +239,111 @@ def terrain_geoms(model: Any) -> list[int]:
     return [k for k in range(model.ngeom) if model.geom(k).name.startswith(f"{PREFIX}_")]
 
 
-def with_terrain(robot: RobotModel, terrain: Terrain) -> RobotModel:
-    """Return a robot's model with a terrain; joints, actuators and step are the same.
+def with_terrain(robot: RobotModel, *terrains: Terrain) -> RobotModel:
+    """Return a robot's model with terrains of different kinds; joints, actuators and step are the same.
 
     Broad-phase bounds of the terrain are computed once, by the compiler, so they are not used: the members of
     a batch may have platforms of other heights.
     """
     spec: Any = mujoco.MjSpec.from_file(str(robot.description.mjcf))
-    add_terrain(spec, terrain)
+    for terrain in terrains:
+        add_terrain(spec, terrain)
     spec.option.timestep = robot.step_s
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     return dataclasses.replace(robot, model=spec.compile())
 
 
-class BatchPlatforms:
-    """Platforms of N simulated robots, each with a height and a distance of its own.
+class BatchTerrain:
+    """Terrains of N simulated robots, each with a kind, a rise and a distance of its own.
 
     Args:
-        batch: The robots; their model has a platform (:func:`with_terrain`).
-        terrain: That platform.
+        batch: The robots; their model has a terrain of each of these kinds (:func:`with_terrain`).
+        kinds: The kinds.
 
     Attributes:
-        rise: Height of each member's platform, (N,) [m]; 0 for a flat floor.
+        kind: Index of each member's kind, (N,).
+        rise: Height of each member's platform or step [m], or angle of its slope [rad], (N,); 0 for a flat
+            floor.
         distance: Where it begins, along x, (N,) [m].
     """
 
-    def __init__(self, batch: ServoBatch, terrain: Terrain) -> None:
+    def __init__(self, batch: ServoBatch, kinds: Sequence[Kind]) -> None:
         model = batch.robot.model
-        self._geoms = terrain_geoms(model)
+        self.kinds = tuple(kinds)
+        self._ids = [
+            [k for k in terrain_geoms(model) if model.geom(k).name.startswith(f"{PREFIX}_{kind}_")]
+            for kind in kinds
+        ]
         self._fields = batch.engine.fields
-        self._nominal = np.array(model.geom_pos[self._geoms])
-        self._terrain = terrain
-        self.rise = np.full(batch.count, terrain.rise)
-        self.distance = np.full(batch.count, terrain.distance_m)
+        self.kind = np.zeros(batch.count, dtype=np.int64)
+        self.rise = np.zeros(batch.count)
+        self.distance = np.full(batch.count, DISTANCE_M)
+        self.place(np.arange(batch.count), self.rise.copy(), self.distance.copy())
 
-    def place(self, members: IntArray, rise: FloatArray, distance: FloatArray) -> None:
-        """Set the platforms of M members.
+    def place(
+        self, members: IntArray, rise: FloatArray, distance: FloatArray, kind: IntArray | None = None
+    ) -> None:
+        """Set the terrains of M members.
 
         Args:
             members: Their indices, (M,).
-            rise: Heights, (M,) [m]; 0 for a flat floor.
+            rise: Heights [m] or angles [rad], (M,); 0 for a flat floor.
             distance: Where they begin, along x, (M,) [m].
+            kind: Indices of their kinds, (M,); None: the first one.
         """
         self.rise[members], self.distance[members] = rise, distance
-        # A platform of height 0 lies below the floor: two surfaces at one height would share each contact.
-        up = np.where(rise > 0.0, rise, -EDGE_M) - self._terrain.rise
-        position = self._fields.get("geom_pos")
-        for number, geom in enumerate(self._geoms):
-            position[members, geom, 0] = self._nominal[number, 0] + distance - self._terrain.distance_m
-            position[members, geom, 2] = self._nominal[number, 2] + up
+        self.kind[members] = 0 if kind is None else kind
+        position, quaternion = self._fields.get("geom_pos"), self._fields.get("geom_quat")
+        for number, (name, ids) in enumerate(zip(self.kinds, self._ids, strict=True)):
+            # mj_setConst notes which geoms are not turned, and then never looks at their quaternion again.
+            risen = np.maximum(rise, LEAST_RISE)
+            geoms = _geoms(name, risen, distance)
+            # What is not there lies below the floor: two surfaces at one height would share each contact.
+            away = (self.kind[members] != number) | (rise <= 0.0)
+            down = np.where(away, _top(name, risen) + EDGE_M, 0.0)
+            for column, geom in enumerate(ids):
+                position[members, geom] = geoms.position[:, column]
+                position[members, geom, 2] -= down
+                quaternion[members, geom] = geoms.quaternion[:, column]
 
     def height(self, x: FloatArray) -> FloatArray:
         """Return the height of each member's ground at places along x, (N, ...) [m]."""
-        shape = (-1, *(1,) * (np.ndim(x) - 1))
-        ahead = x - self.distance.reshape(shape)
-        return np.where((ahead >= 0.0) & (ahead <= LENGTH_M), self.rise.reshape(shape), 0.0)
+        rise, distance = self._like(self.rise, x), self._like(self.distance, x)
+        found = [_height(kind, rise, x - distance) for kind in self.kinds]
+        return np.choose(self._like(self.kind, x), found)
+
+    def top(self) -> FloatArray:
+        """Return the height of each member's last platform, (N,) [m]."""
+        return np.choose(self.kind, [_top(kind, self.rise) for kind in self.kinds])
+
+    def top_begins(self) -> FloatArray:
+        """Return where each member's last platform begins along x, (N,) [m]."""
+        found = [_top_begins(kind, self.rise) for kind in self.kinds]
+        return self.distance + np.choose(self.kind, found)
+
+    def to_edge(self, x: FloatArray) -> FloatArray:
+        """Return the way to each next edge ahead of places along x, (N, ...) [m]; inf where there is none."""
+        return self._nearest(x, lambda way: np.where(way > 0.0, way, np.inf))
+
+    def from_edge(self, x: FloatArray) -> FloatArray:
+        """Return the distance of places along x from the nearest edge, (N, ...) [m]; inf without an edge."""
+        return self._nearest(x, np.abs)
+
+    def _nearest(self, x: FloatArray, measure: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        distance, found = self._like(self.distance, x), []
+        for kind in self.kinds:
+            ways = [measure(distance + edge - x) for edge in _edges(kind)]
+            found.append(np.min([np.full(np.shape(x), np.inf), *ways], axis=0))
+        return np.choose(self._like(self.kind, x), found)
+
+    @staticmethod
+    def _like(values: npt.NDArray[Any], x: FloatArray) -> npt.NDArray[Any]:
+        """Return one value per member in the shape in which it meets places (N, ...)."""
+        return values.reshape(-1, *(1,) * (np.ndim(x) - 1))
 
 
 class Scuffs:
-    """Which of N simulated robots press a leg against the front of their platform.
+    """Which of N simulated robots press a leg against the front of their platform or step.
 
     A contact of the platform with a leg or the trunk counts if its normal is less than 45 degrees from level.
     Contacts are computed again from the coordinates, one robot after the other: this is for scores of some

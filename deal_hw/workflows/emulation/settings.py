@@ -35,8 +35,9 @@ class Go2Options(Checked):
     """lying: limp on the floor; standing: sport mode in control."""
 
     terrain: str = ""
-    """What is ahead on the floor: a platform, box:HEIGHT [m], or a ramp, slope:ANGLE [rad]. It begins 1 m
-    ahead, or at a distance after a comma, such as box:0.2,1.5. By default the floor is flat."""
+    """What is ahead on the floor: a platform, box:HEIGHT [m], three steps, steps:HEIGHT of one [m], or a
+    ramp, slope:ANGLE [rad]. It begins 1 m ahead, or at a distance after a comma, such as box:0.2,1.5. By
+    default the floor is flat."""
 
     sport: Literal["normal", "ai", "advanced", "mcf", "off"] = "normal"
     """The sport mode at power-up. It overrides other commands until it is released."""
