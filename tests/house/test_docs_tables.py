@@ -121,3 +121,16 @@ def test_the_paper_is_mapped_line_by_line() -> None:
     } == set()
     words = {part for name in named - files for part in name.split(".")}
     assert words - words_in_sources() == set()
+
+
+def test_the_files_that_follow_a_verb_have_what_the_page_says() -> None:
+    """Twelve files a verb, in order; each defines the name that the table gives."""
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    part = page.partition("## Follow a verb\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (\d+) \| `([\w/.]+)`, `(\w+)` \|", part, re.MULTILINE)
+    assert [int(number) for number, _, _ in rows] == [*range(1, 13)] * 2
+    for _, file, name in rows:
+        text = (ROOT / file).read_text(encoding="utf-8")
+        assert re.search(rf"^(def|class) {name}\b", text, re.MULTILINE), (file, name)
+    others = re.findall(r"`([\w/]+/[\w/]+\.py)`", part)
+    assert len(others) > 24 and all((ROOT / file).is_file() for file in others)
