@@ -231,6 +231,7 @@ def test_a_preset_that_cannot_stand_is_said() -> None:
         make_case("go2", "ideal", 3, 5.0, "paper", centred=True)
 
 
+@pytest.mark.slow
 def test_rows_of_the_paper_need_a_policys_demonstration(tmp_path: Path) -> None:
     """On motions that excite the row says so; on the policy's own motion it runs."""
     errors = {}

@@ -98,6 +98,7 @@ def test_climbs_are_counted_at_each_height() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_walk_climbs_what_is_flat_and_no_wall(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """With one hidden robot: 2 cm are taken by most, 25 cm by none; a score has all heights."""
     policy = OnnxPolicy(required_policy("go2"))

@@ -53,6 +53,7 @@ def hinge(tmp_path: Path) -> Recordings:
     )
 
 
+@pytest.mark.slow
 def test_a_calibrated_model_predicts_unseen_motion_better_than_the_given_one(
     hinge: Recordings, tmp_path: Path
 ) -> None:

@@ -51,6 +51,7 @@ def plan(path: Path, **more: Any) -> RunPlan:
     return RunPlan(robot="go2", transport="dds", policy=str(path), velocity="0.3,0,0", **more)
 
 
+@pytest.mark.slow
 def test_an_import_is_printed_tried_and_deploys(
     tmp_path: Path, verb: Callable[..., tuple[int, str, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -115,6 +116,7 @@ def test_what_would_fall_is_not_written(
     assert sorted(file.name for file in tmp_path.iterdir()) == ["run"]
 
 
+@pytest.mark.slow
 def test_a_forced_import_is_asked_about(
     tmp_path: Path, verb: Callable[..., tuple[int, str, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -280,6 +280,7 @@ def test_the_base_install_records_checks_and_converts(tmp_path: Path, port: str)
     assert "states a second" in examined.stdout, examined.stdout + examined.stderr
 
 
+@pytest.mark.slow
 def test_deploy_runs_without_extras(tmp_path: Path, port: str, policy: Path) -> None:
     """An ONNX policy runs and is recorded, and its recording replays."""
     robot = ("--port", port, "--out", "run")

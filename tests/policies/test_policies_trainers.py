@@ -289,6 +289,7 @@ def test_a_resumed_training_takes_up_the_optimisers_memory(kept: Path, tmp_path:
     assert not restore_optimisers(tmp_path / "none.zip", fresh)
 
 
+@pytest.mark.slow
 def test_only_the_same_unfinished_training_is_resumed(kept: Path) -> None:
     """A complete one would lose its averaged weights; of another distribution it would claim all steps."""
     rng, files = np.random.default_rng(0), TrainingFiles(checkpoint=kept, resume=True)

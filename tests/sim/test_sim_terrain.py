@@ -166,6 +166,7 @@ def test_without_terrain_the_model_is_as_before() -> None:
     assert not raised.geom("FL_thigh").contype & floor.conaffinity
 
 
+@pytest.mark.slow
 def test_the_emulated_robot_meets_its_terrain() -> None:
     """The walking policy goes up a ramp of 0.15 rad; a platform of 0.2 m stops it, as expected."""
     policy = OnnxPolicy(required_policy("go2"))

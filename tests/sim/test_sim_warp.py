@@ -332,7 +332,9 @@ def test_every_kind_of_a_model_field_agrees(kind: str) -> None:
 
 
 @slow
-@pytest.mark.parametrize(("robot", "task"), [("cartpole", ""), ("go2", ""), ("go2", "climb"), ("go2", "terrain")])
+@pytest.mark.parametrize(
+    ("robot", "task"), [("cartpole", ""), ("go2", ""), ("go2", "climb"), ("go2", "terrain")]
+)
 def test_environments_agree(robot: str, task: str) -> None:
     """Five ticks of four robots, of which two are restarted: observations and rewards, to rounding."""
     distribution = udr_distribution(robot, task)

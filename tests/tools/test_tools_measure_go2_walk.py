@@ -25,6 +25,7 @@ def policy() -> OnnxPolicy:
     return OnnxPolicy(path)
 
 
+@pytest.mark.slow
 def test_the_shipped_policy_walks_where_it_is_told(policy: OnnxPolicy) -> None:
     """A hidden robot of the profile `realistic`: no trip, ahead at 1 m/s within 0.2 m/s and 0.2 rad/s."""
     script = Walk(((0.0, (0.0, 0.0, 0.0)), (1.5, (1.0, 0.0, 0.0))), 4.5)

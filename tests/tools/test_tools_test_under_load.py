@@ -27,6 +27,7 @@ def test_failures_are_read_from_the_summary() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_every_run_is_beside_the_loops_and_failures_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

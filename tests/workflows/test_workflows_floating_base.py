@@ -145,6 +145,7 @@ def test_the_free_joint_gets_the_recorded_base(ant: Ant) -> None:
         assert np.abs(position[1] - places).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_distributions_of_the_whole_state_find_the_truth(ant: Ant) -> None:
     """Both dampings within 10 % from drawn start states, where the model's are 33 and 67 % off."""
     settings = ant.settings(population=40, generations=25, starts="drawn")

@@ -32,6 +32,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_from_two_files_to_an_inspected_calibration(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """new, check, import, info, calibrate, inspect; nothing after the import names robot or model."""
     dataset = made / "run" / "dataset"

@@ -38,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 0.6
 
 
+@pytest.mark.slow
 def test_a_robot_is_emulated_recorded_and_replayed(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

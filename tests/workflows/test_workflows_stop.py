@@ -206,6 +206,7 @@ def test_a_cartpole_is_stopped_with_and_without_a_run(
     assert "was NOT made passive" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_go2_is_damped_whoever_holds_it(
     rig: Callable[..., Rig], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
