@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -121,12 +122,16 @@ def test_parameters_and_states_go_on(robot: RobotModel) -> None:
 
 
 @slow
-def test_one_world_that_diverges_is_alone(robot: RobotModel) -> None:
-    """A start that is no number: that member is NaN in that window, and the others are as without it."""
+def test_one_world_that_diverges_is_alone(robot: RobotModel, caplog: pytest.LogCaptureFixture) -> None:
+    """A start that is no number: that member is NaN in that window, and the others are as without it.
+
+    One line says it, once, with what to do.
+    """
     position, velocity = starts(3, 2)
     command = np.full((3, 2, 20, 1), 0.05)
     batch = members(robot, WARP)
     sound = batch.advance_windows((position, velocity), command, 10)
+    assert not caplog.records
     velocity[1, 0, 1] = np.nan
     x, v = batch.advance_windows((position, velocity), command, 10)
     bad = np.zeros((3, 2), dtype=bool)
@@ -140,6 +145,8 @@ def test_one_world_that_diverges_is_alone(robot: RobotModel) -> None:
     batch.set_state(np.array([[0.0, 0.1], [np.nan, 0.1], [0.0, 0.2]]), np.zeros((3, 2)))
     x, _ = batch.advance(command[:, 0])
     assert np.isnan(x[:, -1, 0]).tolist() == [False, True, False]
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith("1 of 6 worlds diverged") and "--engine mujoco" in line
     # As in MuJoCo, a member that diverged begins anew where the model does.
     assert np.isfinite(batch.position).all()
 
@@ -148,12 +155,18 @@ def test_one_world_that_diverges_is_alone(robot: RobotModel) -> None:
 def test_too_many_worlds_are_refused_with_the_number_that_fits(
     robot: RobotModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before anything is simulated; fewer are simulated in parts."""
+    """Before anything is simulated. By hand: 100 bytes a world, 70 % of 400 bytes are free for 2 of them."""
+    import psutil
+
     from deal_hw.sim.engine import warp_engine
 
-    monkeypatch.setattr(warp_engine._Worlds, "bytes", property(lambda worlds: 4e12))
-    with pytest.raises(ConfigurationError, match=r"3 members do not fit .* at most 0 worlds"):
+    free = {"available": 400.0}
+    monkeypatch.setattr(warp_engine._Worlds, "bytes", property(lambda worlds: 100.0 * worlds.count))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(**free))
+    with pytest.raises(ConfigurationError, match=r"3 members do not fit .* at most 2 worlds .*--members 2,"):
         members(robot, WARP)
+    free["available"] = 430.0
+    assert members(robot, WARP).engine.windows == 1
 
 
 @slow

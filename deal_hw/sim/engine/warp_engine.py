@@ -96,6 +96,7 @@ class WarpEngine:
         self._count = count
         self._worlds: _Worlds | None = None
         self._growth = 1
+        self._told = False
         self.fields = _SeenFields(self._members.fields)
         self._fitting = self._measure()
         self.windows = max(min(MOST_WORLDS, self._fitting) // count, 1)
@@ -159,8 +160,14 @@ class WarpEngine:
             name: np.moveaxis(values.reshape(len(values), windows, count, -1), 2, 0).swapaxes(1, 2)
             for name, values in records.items()
         }
-        if bad.any():
-            logging.getLogger(__name__).debug("%d of %d worlds diverged", np.count_nonzero(bad), bad.size)
+        if bad.any() and not self._told:
+            self._told = True
+            logging.getLogger(__name__).warning(
+                "%d of %d worlds diverged: their states are no numbers, or beyond %.0e. These members count "
+                "as failed, and the others go on (this is said once). If many fail, narrow the ranges or "
+                "take a smaller physics step; --engine mujoco computes in float64",
+                *(np.count_nonzero(bad), bad.size, DIVERGED),
+            )
         if goes_on:
             self._keep(worlds, bad[:, 0])
         return shaped, bad
