@@ -60,7 +60,7 @@ SUPPLY: Final = Supply(
     kind="B2",
     lowest=40.0,
     highest=60.0,
-    other="it may be a Go2 or an H1, which have the same messages; take robot `go2` if it is a Go2",
+    other="it may be a Go2, which has the same messages; take robot `go2` if it is one",
 )
 """14 cells, 58.8 V when charged; a Go2 has at most 33.6 V."""
 

@@ -15,6 +15,7 @@ from deal_hw.drivers.go2.messages.simulated import NOTICE, Simulator, decode_sim
 from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.unitree.doctor import Received, UnitreeDoctor
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
+from deal_hw.drivers.unitree.go_messages.robot_kind import quadruped_complaint
 from deal_hw.drivers.unitree.supply import Supply
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.findings import Finding, Severity
@@ -87,10 +88,11 @@ class Go2Doctor(UnitreeDoctor[LowStateFrame]):
         return "" if self._simulated else (yield from super()._asked_mode())
 
     def _judge_motors(self, frame: LowStateFrame) -> Iterator[Finding]:
+        wrong = (quadruped_complaint(frame.payload, self.kind), self.supply.complaint(frame.voltage))
+        for text in filter(None, wrong):
+            yield Finding("robot", Severity.FAIL, text, "choose the robot that it is")
         if self._simulated:
             return
-        if wrong := self.supply.complaint(frame.voltage):
-            yield Finding("robot", Severity.FAIL, wrong, "choose the robot that it is")
         charge = frame.battery_percent
         text = f"battery {charge} %, {frame.voltage:.1f} V, {frame.current:.1f} A"
         yield Finding.judged("robot", charge < 20, text, "charge it")

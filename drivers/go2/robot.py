@@ -19,6 +19,7 @@ from deal_hw.drivers.go2.wording import WORDING
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.go_messages.body import body_state
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
+from deal_hw.drivers.unitree.go_messages.robot_kind import quadruped_complaint
 from deal_hw.drivers.unitree.motor_command import MODE_SERVO
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.robot import SUBSCRIBED, UnitreeRobot
@@ -114,7 +115,10 @@ class Go2Robot(UnitreeRobot[LowStateFrame]):
 
     def _await_robot(self) -> None:
         super()._await_robot()
-        if self._frame is not None and (wrong := self.supply.complaint(self._frame.voltage)):
+        if self._frame is None:
+            return
+        wrong = quadruped_complaint(self._frame.payload, self.supply.kind)
+        if wrong := wrong or self.supply.complaint(self._frame.voltage):
             raise WrongDeviceError(f"{self.wording.name}: {wrong}. Nothing was sent")
 
     def _forget(self) -> None:

@@ -9,11 +9,12 @@ import numpy as np
 
 from deal_hw.clock import Clock
 from deal_hw.drivers.go2.messages.refusals import StateCheck
-from deal_hw.drivers.h1.messages import FOUR_LEGS, H1Refusals, H1StateDecoder, has_four_legs
+from deal_hw.drivers.h1.messages import H1Refusals, H1StateDecoder
 from deal_hw.drivers.h1.robot import WORDING
 from deal_hw.drivers.unitree.crane import CONTROLLER, LEVEL, RELEASED
 from deal_hw.drivers.unitree.doctor import UnitreeDoctor
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
+from deal_hw.drivers.unitree.go_messages.robot_kind import humanoid_complaint
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.findings import Finding, Severity
 from deal_hw.transport import TopicTransport
@@ -50,7 +51,7 @@ class H1Doctor(UnitreeDoctor[LowStateFrame]):
         return self._decoder.decode(payload, self._strict)
 
     def _judge_motors(self, frame: LowStateFrame) -> Iterator[Finding]:
-        if has_four_legs(frame):
-            yield Finding("robot", Severity.FAIL, FOUR_LEGS, "choose the robot that it is")
+        if wrong := humanoid_complaint(frame.payload):
+            yield Finding("robot", Severity.FAIL, wrong, "choose the robot that it is")
         hottest = int(np.max(frame.temperature))
         yield Finding.judged("robot", hottest > WARM_C, f"hottest motor {hottest} °C", "let it cool down")

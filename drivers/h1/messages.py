@@ -1,9 +1,9 @@
-"""What an H1's states say beside the message: which robot it is, and how its pelvis lies and turns."""
+"""What an H1's states say beside the message: how its pelvis lies and turns."""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 
@@ -11,13 +11,6 @@ from deal_hw.drivers.go2.messages.refusals import Refusals
 from deal_hw.drivers.h1.joints import ORDER, TORSO
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateDecoder, LowStateFrame
 from deal_hw.types import FloatArray
-
-FOUR_LEGS: Final = (
-    "its arms' motors (12 to 19) report nothing at all, as those of a Go2 or B2, which have the same "
-    "messages: take robot `go2` or `b2` if it is one"
-)
-_ARM_JOINTS: Final = np.flatnonzero(ORDER.motors >= 12)
-"""Joints whose motors a Go2 or B2 has not."""
 
 
 class H1Refusals(Refusals):
@@ -31,11 +24,6 @@ class H1StateDecoder(LowStateDecoder):
 
     def __init__(self) -> None:
         super().__init__(ORDER)
-
-
-def has_four_legs(frame: LowStateFrame) -> bool:
-    """Return whether a state is that of a Go2 or B2: nothing in the slots of an H1's arms."""
-    return not (frame.position[_ARM_JOINTS].any() or frame.temperature[_ARM_JOINTS].any())
 
 
 def pelvis_motion(

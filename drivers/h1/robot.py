@@ -13,12 +13,13 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.go2.messages.refusals import StateCheck, is_strict
 from deal_hw.drivers.h1.description import DESCRIPTION
 from deal_hw.drivers.h1.joints import MODES, ORDER, SERVO_MODE
-from deal_hw.drivers.h1.messages import FOUR_LEGS, H1Refusals, H1StateDecoder, has_four_legs, pelvis_of
+from deal_hw.drivers.h1.messages import H1Refusals, H1StateDecoder, pelvis_of
 from deal_hw.drivers.unitree.claim import WireClaim
 from deal_hw.drivers.unitree.crane import STOP_BUTTONS, HungRobot, hung, on_crane, wording
 from deal_hw.drivers.unitree.go_messages.body import body_state
 from deal_hw.drivers.unitree.go_messages.low_command import GoCommand, GoCommandEncoder
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
+from deal_hw.drivers.unitree.go_messages.robot_kind import humanoid_complaint
 from deal_hw.drivers.unitree.remote import Remote
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
@@ -88,8 +89,8 @@ class H1Robot(HungRobot[LowStateFrame]):
 
     def _await_robot(self) -> None:
         super()._await_robot()
-        if self._frame is not None and has_four_legs(self._frame):
-            raise WrongDeviceError(f"h1: {FOUR_LEGS}. Nothing was sent")
+        if self._frame is not None and (wrong := humanoid_complaint(self._frame.payload)):
+            raise WrongDeviceError(f"h1: {wrong}. Nothing was sent")
 
     def _encode(
         self,
@@ -108,7 +109,7 @@ class H1Robot(HungRobot[LowStateFrame]):
         return H1Info(values.serial, values.version)
 
     def _frame_fault(self, frame: LowStateFrame) -> str:
-        return f"h1: {FOUR_LEGS}" if has_four_legs(frame) else ""
+        return f"h1: {wrong}" if (wrong := humanoid_complaint(frame.payload)) else ""
 
     def _body(self, frame: LowStateFrame, remote: Remote | None) -> BodyState:
         orientation, angular_velocity, specific_force = pelvis_of(frame)

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from fakes.go2 import FakeBench, FakeTopics, TopicBench
+from fakes.go2 import FakeTopics, TopicBench
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,6 +17,12 @@ from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopRepor
 from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
 from deal_hw.control.safety.safety import CycleInput, Safety
+from deal_hw.drivers.b2.doctor import B2Doctor
+from deal_hw.drivers.b2.emulator import B2Truth
+from deal_hw.drivers.b2.robot import B2Robot
+from deal_hw.drivers.go2.doctor import Go2Doctor
+from deal_hw.drivers.go2.emulator.device import Go2Device
+from deal_hw.drivers.go2.emulator.truth import Go2Truth
 from deal_hw.drivers.go2.robot import Go2Robot
 from deal_hw.drivers.h1 import description as facts
 from deal_hw.drivers.h1.description import DESCRIPTION, SPACES
@@ -28,6 +34,7 @@ from deal_hw.drivers.h1.messages import H1StateDecoder, pelvis_motion
 from deal_hw.drivers.h1.robot import H1Claim, H1Robot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
+from deal_hw.drivers.unitree.emulated_quadruped import QuadrupedTruth
 from deal_hw.drivers.unitree.go_messages import layout
 from deal_hw.drivers.unitree.go_messages.low_command import (
     GoCommand,
@@ -203,15 +210,35 @@ def test_every_end_is_damping() -> None:
         np.testing.assert_array_equal(command.damping, DESCRIPTION.passive_damping)
 
 
-def test_a_go2_is_no_h1() -> None:
+@pytest.mark.parametrize("truth", [Go2Truth.nominal(), B2Truth.nominal()], ids=["go2", "b2"])
+def test_a_go2_or_b2_is_no_h1(truth: QuadrupedTruth) -> None:
     """The same messages, nothing in the arms' slots: nothing is sent, and the right robots are named."""
-    go2 = FakeBench(Go2Robot)
-    robot = H1Robot(go2.topics, go2.clock, hung_on_crane=True)
-    with pytest.raises(WrongDeviceError, match=r"h1: .*12 to 19.*`go2` or `b2`.*Nothing was sent"):
+    clock = VirtualClock(10**9)
+    device = Go2Device(truth)
+    robot = H1Robot(VirtualTopics(device, clock), clock, hung_on_crane=True)
+    with pytest.raises(WrongDeviceError, match=r"h1: .*16 to 19.*`go2` or `b2`.*Nothing was sent"):
         robot.connect()
-    assert go2.device.received == [] and go2.device.requests == []
-    found = list(H1Doctor(go2.topics, go2.clock, 1.0).run())
+    assert device.report()["commands"]["accepted"] == 0 and device.sport_name != ""
+    found = list(H1Doctor(VirtualTopics(device, clock), clock, 1.0).run())
     assert any(f.severity is Severity.FAIL and "`go2`" in f.seen for f in found)
+
+
+@pytest.mark.parametrize("kind", [Go2Robot, B2Robot])
+def test_an_h1_is_no_go2_or_b2(kind: type[Go2Robot]) -> None:
+    """Whatever its battery has, it is known by its arms: nothing is sent, and the right robot is named."""
+    wire = H1Bench()
+    robot = kind(wire.topics, wire.clock)
+    with pytest.raises(WrongDeviceError, match=r"motors 16 to 19.*an H1.*robot `h1`.*Nothing was sent"):
+        robot.connect()
+    assert wire.received == [] and wire.device.controller_name == "ai"
+
+
+@pytest.mark.parametrize("kind", [Go2Doctor, B2Doctor])
+def test_the_doctors_of_other_robots_know_an_h1(kind: type[Go2Doctor]) -> None:
+    """A failed check names it."""
+    wire = H1Bench()
+    found = list(kind(wire.topics, wire.clock, 1.0).run())
+    assert any(f.severity is Severity.FAIL and "robot `h1`" in f.seen for f in found)
 
 
 def test_an_unknown_check_is_refused() -> None:

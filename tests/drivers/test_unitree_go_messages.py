@@ -1,10 +1,14 @@
-"""unitree_go's low-level messages for any motors: round trips, slots without a joint, the Go2's order."""
+"""unitree_go's low-level messages for any motors: round trips, slots without a joint, kinds of robots."""
 
 from __future__ import annotations
 
+import re
+import struct
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,6 +23,7 @@ from deal_hw.drivers.unitree.go_messages.low_command import (
     decode_low_command,
 )
 from deal_hw.drivers.unitree.go_messages.low_state import LowState, LowStateDecoder, encode_low_state
+from deal_hw.drivers.unitree.go_messages.robot_kind import humanoid_complaint, quadruped_complaint
 
 SPARE = np.arange(SLOTS) % 3
 MOTORS = st.lists(st.integers(0, SLOTS - 1), min_size=1, max_size=SLOTS, unique=True)
@@ -120,3 +125,53 @@ def test_the_go2_is_one_order_among_others(seed: int) -> None:
     assert payload == GoCommandEncoder(ORDER.motors, np.ones(SLOTS, np.int64)).encode(sent)
     assert go2_state.encode_low_state(said) == encode_low_state(said, ORDER)
     assert_same(go2_state.decode_low_state(encode_low_state(said, ORDER)).values(), said)
+
+
+# Which robot a state is of. The frames are made by hand: zeros, and a motor's q or temperature by its offset.
+
+Q_AT, TEMPERATURE_AT, MOTOR_BYTES = 84, 112, 48
+GO2, GO2_W, H1 = range(12), range(16), [slot for slot in range(20) if slot != 9]
+
+
+def reporting(slots: Iterable[int], *, cold: bool = False) -> bytes:
+    """Return a LowState in which slots report a position and, unless cold, a temperature."""
+    buffer = bytearray(layout.LOW_STATE_BYTES)
+    for slot in slots:
+        struct.pack_into("<f", buffer, Q_AT + MOTOR_BYTES * slot, -0.01)
+        buffer[TEMPERATURE_AT + MOTOR_BYTES * slot] = 0 if cold else 31
+    return bytes(buffer)
+
+
+@pytest.mark.parametrize("cold", [False, True])
+@pytest.mark.parametrize(
+    ("slots", "quadruped", "humanoid"),
+    [
+        (GO2, "", "take robot `go2` or `b2`"),
+        (H1, "16 to 19.*take robot `h1`", ""),
+        (range(20), "16 to 19.*take robot `h1`", ""),
+        (GO2_W, "12 to 15.*Go2-W.*do not command", "16 to 19"),
+        # An H1 whose arms are off, or are not there.
+        ([slot for slot in H1 if slot < 12], "motor 9.*take robot `h1`", "16 to 19"),
+    ],
+    ids=["go2", "h1", "h1 with slot 9", "go2-w", "h1 without arms"],
+)
+def test_the_slots_that_report_tell_the_robot(
+    slots: Iterable[int], quadruped: str, humanoid: str, cold: bool
+) -> None:
+    """By positions alone, too, as those of a simulator without temperatures."""
+    payload = reporting(slots, cold=cold)
+    for found, expected in (
+        (quadruped_complaint(payload, "Go2"), quadruped),
+        (humanoid_complaint(payload), humanoid),
+    ):
+        assert re.search(expected, found) if expected else found == ""
+
+
+@given(st.integers(0, 19), st.floats(-3.0, 3.0, width=32).filter(bool), st.integers(1, 255))
+def test_one_more_motor_makes_no_go2(slot: int, position: float, temperature: int) -> None:
+    """A single value in a slot beyond 11 is enough; inside, a Go2 remains one."""
+    for offset, value in ((Q_AT, struct.pack("<f", position)), (TEMPERATURE_AT, bytes([temperature]))):
+        payload = bytearray(reporting(GO2))
+        at = offset + MOTOR_BYTES * slot
+        payload[at : at + len(value)] = value
+        assert bool(quadruped_complaint(bytes(payload), "Go2")) == (slot > 11)

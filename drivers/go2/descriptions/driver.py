@@ -26,7 +26,7 @@ SUPPLY: Final = Supply(
     kind="Go2",
     lowest=0.0,
     highest=40.0,
-    other="it may be a B2 or an H1, which have the same messages; take robot `b2` if it is a B2",
+    other="it may be a B2, which has the same messages; take robot `b2` if it is one",
 )
 """Data sheets: 8 cells, at most 33.6 V; a B2 has 14, at least 42 V. A simulator in place of a Go2 says 0."""
 FLAIL_RAD_S: Final[Mapping[str, float]] = {"hip": 20.0, "thigh": 20.0, "calf": 10.5}
