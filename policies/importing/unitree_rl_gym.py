@@ -37,6 +37,9 @@ TERMS: Final[Mapping[str, Quantity]] = {
     "phase": "clock",
 }
 """Names for ``--observations``; the format itself has none."""
+TORSO_SENSORS: Final[Mapping[str, str]] = {"h1": "torso_joint"}
+"""Robots with their inertial sensor in the torso, and the joint by which it turns on the pelvis. The driver
+turns its values to the pelvis by that joint, as transform_imu_data of rotation_helper.py does."""
 CLOCK_HZ: Final = 1.0 / 0.8
 """Turns of the clock per second in deploy_real.py."""
 _WALK: Final = ("base_ang_vel", "projected_gravity", "commands", "joint_pos", "joint_vel", "actions", "phase")
@@ -69,11 +72,6 @@ def parse(values: Any, answers: Supplement, robot: str) -> ForeignPolicy:
     found = section(values, "the yaml", _KEYS.split(), _NEEDED.split())
     count = whole(found["num_actions"], "num_actions", 1, 256)
     joints = _joints(found, count, answers, robot)
-    if found.get("imu_type") == "torso" and found.get("arm_waist_joint2motor_idx"):
-        raise ConfigurationError(
-            "imu_type: torso; the runner turns that sensor's values by the waist's angle, which is not done "
-            "here; use a policy whose imu_type is pelvis"
-        )
     names = _names(found, count, answers, robot)
     factors = {
         **{name: (number(found[key], key),) for name, key in _SCALES.items()},
@@ -85,6 +83,7 @@ def parse(values: Any, answers: Supplement, robot: str) -> ForeignPolicy:
         row(found[name], name, count) for name in ("kps", "kds", "default_angles", "action_scale")
     )
     held = _held(found, answers, robot)
+    _check_sensor(found, held, robot)
     clock = answers.get("clock") if "phase" in names else None
     return ForeignPolicy(
         format=FORMAT,
@@ -158,6 +157,30 @@ def _held(found: Mapping[str, Any], answers: Supplement, robot: str) -> tuple[Fo
         row(found.get(f"arm_waist_{n}"), f"arm_waist_{n}", len(names)) for n in ("kps", "kds", "target")
     )
     return joints_of(names, pose, kps, kds)
+
+
+def _check_sensor(found: Mapping[str, Any], held: Sequence[ForeignJoint], robot: str) -> None:
+    """Refuse a sensor in the torso unless the driver turns its values to the pelvis as the runner does.
+
+    The network observes the pelvis in either case. Motor numbers do not show a wrong robot: those of an H1-2
+    are all in a G1, at other joints.
+    """
+    if found.get("imu_type") != "torso":
+        return
+    if robot not in TORSO_SENSORS:
+        raise ConfigurationError(
+            "imu_type is torso: the policy is for a robot whose inertial sensor is in the torso, and "
+            f"{robot!r} is not known as one; if it is for another robot, name that (--robot; known with such "
+            f"a sensor: {', '.join(TORSO_SENSORS)}); if it is for {robot!r}, whose states must have the "
+            "orientation of its pelvis, write imu_type: pelvis"
+        )
+    first = held[0].name if held else "none"
+    if first != TORSO_SENSORS[robot]:
+        raise ConfigurationError(
+            "imu_type is torso: the runner turns the sensor's values by the first joint of "
+            f"arm_waist_joint2motor_idx, which is {first}, but the sensor of {robot!r} turns with "
+            f"{TORSO_SENSORS[robot]}; put that joint's motor first"
+        )
 
 
 def _period_s(found: Mapping[str, Any]) -> float:

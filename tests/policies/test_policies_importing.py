@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 import onnx
@@ -16,7 +18,10 @@ from fakes.foreign_policy import DESCRIPTION, ISAAC, STIFFNESS, Foreign, pose
 from onnx import TensorProto, helper, numpy_helper
 
 from deal_hw.drivers.go2.messages.wire import WIRE_JOINTS
-from deal_hw.errors import PolicyError
+from deal_hw.drivers.h1.description import DESCRIPTION as H1
+from deal_hw.drivers.h1.joints import MOTORS
+from deal_hw.drivers.h1.messages import pelvis_motion
+from deal_hw.errors import ConfigurationError, PolicyError
 from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.policies.importing.manifest import adapter_of, spec_of
 from deal_hw.policies.importing.network import ForeignNetwork
@@ -26,6 +31,7 @@ from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.policies.trial import check_policy
 from deal_hw.policies.trial_states import GivenVelocity, ProbeStates
 from deal_hw.policy import ObservationBuilder, PolicySpec
+from deal_hw.robots import driver_description, robot_entry
 from deal_hw.rotations import rotation_vector
 from deal_hw.types import FloatArray
 from deal_hw.workflows.shipped import required_policy
@@ -60,15 +66,15 @@ def modules() -> Any:
 def imported(tmp_path: Path) -> Callable[..., OnnxPolicy]:
     """Return what imports files and returns the policy that deploys."""
 
-    def run(source: Path, config: Path | None = None, **answers: Any) -> OnnxPolicy:
-        found = find_source(source, config)
+    def run(source: Path, config: Path | None = None, *, robot: str = "go2", **answers: Any) -> OnnxPolicy:
+        found, description = find_source(source, config), driver_description(robot)
         with ForeignNetwork(found.network) as network:
-            given = Supplement(**{"motors": WIRE_JOINTS, **answers})
-            policy = describe(found, network.metadata, given, "go2")
+            given = Supplement(**{"motors": robot_entry(robot).motor_joints(), **answers})
+            policy = describe(found, network.metadata, given, robot)
             network.open(policy.observations)
-            spec = spec_of(policy, DESCRIPTION, recurrent=bool(network.memory), training={})
+            spec = spec_of(policy, description, recurrent=bool(network.memory), training={})
             path = tmp_path / "imported.onnx"
-            path.write_bytes(network.file(spec, adapter_of(policy, DESCRIPTION)))
+            path.write_bytes(network.file(spec, adapter_of(policy, description)))
         return OnnxPolicy(path)
 
     return run
@@ -466,6 +472,71 @@ def test_joints_without_an_action_keep_their_pose(
         assert policy.spec.stiffness[place] == 60.0
     moving = [DESCRIPTION.actuated.index(name) for name in legs]
     assert (found[:, moving].std(axis=0) > 1e-3).all()
+
+
+def test_an_h1s_policy_observes_what_its_own_runner_gives_it(
+    tmp_path: Path, imported: Callable[..., OnnxPolicy]
+) -> None:
+    """The sensor is in the torso: turning and gravity are the pelvis's, whatever the torso's angle and speed.
+
+    The expected values are deploy_real.py's: transform_imu_data of rotation_helper.py, in matrices.
+    """
+    # The network's answers are the first six numbers of its observation, and the targets show them.
+    (tmp_path / "policy.onnx").write_bytes(linear_network(np.eye(10, 41)).SerializeToString())
+    config = foreign_policy.write_yaml(tmp_path / "h1.yaml", foreign_policy.h1_gym_yaml())
+    policy = imported(tmp_path / "policy.onnx", config, robot="h1")
+    joints = [
+        H1.actuated.index(MOTORS[motor]) for motor in foreign_policy.h1_gym_yaml()["leg_joint2motor_idx"]
+    ]
+    behaviour = PolicyBehaviour(policy, H1, GivenVelocity())
+    rng = np.random.default_rng(4)
+    for probe in ProbeStates(H1).random(20, rng):
+        behaviour.reset()
+        quaternion = rng.standard_normal(4)
+        quaternion /= np.linalg.norm(quaternion)
+        turning, force = rng.uniform(-3.0, 3.0, (2, 3))
+        angle, speed = rng.uniform(-2.0, 2.0, 2)
+        body = dict(
+            zip(
+                ("orientation", "angular_velocity", "acceleration"),
+                pelvis_motion(quaternion, turning, force, angle, speed),
+                strict=True,
+            )
+        )
+        assert probe.state.body is not None
+        state = dataclasses.replace(probe.state, body=dataclasses.replace(probe.state.body, **body))
+        target = behaviour.command(state, 0.0).position_target[joints]
+        torso = np.empty(9)
+        mujoco.mju_quat2Mat(torso, quaternion)
+        waist = np.array(((np.cos(angle), -np.sin(angle), 0), (np.sin(angle), np.cos(angle), 0), (0, 0, 1)))
+        expected = np.zeros(10)
+        expected[:3] = 0.25 * (waist @ turning - (0, 0, speed))
+        expected[3:6] = (torso.reshape(3, 3) @ waist.T).T @ (0, 0, -1)
+        expected[6:9] = 0.0  # No velocity is wanted.
+        expected[9] = state.position[joints[0]]
+        np.testing.assert_allclose(
+            target, foreign_policy.h1_gym_yaml()["default_angles"] + 0.25 * expected, atol=TARGET_RAD
+        )
+        held = {name: k for k, name in enumerate(H1.actuated) if k not in joints}
+        assert len(held) == 9 and policy.spec.stiffness[held["torso_joint"]] == 300.0
+
+
+def test_a_sensor_in_another_torso_is_refused(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
+    """A robot whose sensor is in the pelvis, or a first joint by which an H1's sensor does not turn."""
+    (tmp_path / "policy.onnx").write_bytes(linear_network(np.eye(10, 41)).SerializeToString())
+
+    def refused(robot: str, said: str, **changes: Any) -> None:
+        config = foreign_policy.write_yaml(tmp_path / "h1.yaml", {**foreign_policy.h1_gym_yaml(), **changes})
+        with pytest.raises(ConfigurationError, match=said):
+            imported(tmp_path / "policy.onnx", config, robot=robot)
+
+    refused("g1", r"imu_type is torso.*'g1' is not known as one.*such a sensor: h1.*imu_type: pelvis")
+    refused(
+        "h1",
+        "which is left_shoulder_pitch_joint.*turns with torso_joint; put that joint's motor first",
+        arm_waist_joint2motor_idx=[16, 6, 17, 18, 19, 12, 13, 14, 15],
+    )
+    refused("h1", "which is none", arm_waist_joint2motor_idx=None)
 
 
 def test_a_fixed_batch_stays_one(tmp_path: Path, imported: Callable[..., OnnxPolicy]) -> None:
