@@ -263,4 +263,17 @@ CLIENTS: Final = (
         exit_codes=(130, 1, -2),
         must_not=(),
     ),
+    Client(
+        name="h1_low_level_example.py",
+        source="unitree_sdk2_python/example/h1/low_level/h1_low_level_example.py",
+        command=("{source}", "{port}"),
+        emulator=("h1", "--transport", "dds", "--port", "lo", "--profile", "ideal", "--nominal"),
+        paths=("unitree_sdk2_python",),
+        own_python=True,
+        keys=(("Press Enter", "\n"),),
+        # It waits for its own controller's release, and takes all joints to 0 within 10 s.
+        must=(r"rpy: \[ -?\d", "Done!"),
+        # The example ends with sys.exit(-1).
+        exit_codes=(255,),
+    ),
 )
