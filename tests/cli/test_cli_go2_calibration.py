@@ -11,17 +11,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from fakes.virtual_runs import record_run
 
 from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.design_excitation import KINDS as DESIGN_EXCITATION
 from deal_hw.cli.design_excitation import design_excitation
 from deal_hw.clock import VirtualClock
-from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig
-from deal_hw.control.process.channel import Outcome
-from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.dataset import Dataset
-from deal_hw.data.recording.record import CycleRecord
-from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as SIMULATED
 from deal_hw.drivers.go2.descriptions.floor import LEGS
@@ -35,7 +31,7 @@ from deal_hw.motions.excitation.limits import room
 from deal_hw.motions.excitation.plan import ExcitationDesign, make_plan, read_plan
 from deal_hw.robots import parameter_spaces
 from deal_hw.workflows.calibration.run import CalibrateReport
-from deal_hw.workflows.running.plan import RunPlan, make_behaviour
+from deal_hw.workflows.running.plan import RunPlan
 
 HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness", "damping"))
 
@@ -43,25 +39,7 @@ HIPS = tuple(f"{leg}_hip_joint.{name}" for leg in LEGS for name in ("stiffness",
 def record(device: Go2Device, dataset: Dataset, plan: RunPlan) -> None:
     """Record a run of an emulated robot in virtual time."""
     clock = VirtualClock(10**9)
-    robot = Go2OnStandRobot(VirtualTopics(device, clock), clock)
-    path = dataset.next_episode_path()
-    with EpisodeRecorder(path, DESCRIPTION.to_json(), {"profile": plan.motion}, clock) as recorder:
-
-        def sink(cycle: CycleRecord) -> bool:
-            recorder.write(cycle)
-            return True
-
-        loop = ControlLoop(
-            robot,
-            make_behaviour(plan, DESCRIPTION),
-            Safety(DESCRIPTION),
-            clock,
-            sink,
-            LoopConfig(duration_s=plan.seconds),
-        )
-        report = loop.run()
-    assert report.outcome is Outcome.FINISHED, report.reason
-    dataset.note_episode(path)
+    record_run(Go2OnStandRobot(VirtualTopics(device, clock), clock), clock, dataset, plan)
 
 
 @pytest.fixture(scope="module")

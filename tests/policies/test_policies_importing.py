@@ -496,15 +496,12 @@ def test_an_h1s_policy_observes_what_its_own_runner_gives_it(
         quaternion /= np.linalg.norm(quaternion)
         turning, force = rng.uniform(-3.0, 3.0, (2, 3))
         angle, speed = rng.uniform(-2.0, 2.0, 2)
-        body = dict(
-            zip(
-                ("orientation", "angular_velocity", "acceleration"),
-                pelvis_motion(quaternion, turning, force, angle, speed),
-                strict=True,
-            )
-        )
+        orientation, rate, acceleration = pelvis_motion(quaternion, turning, force, angle, speed)
         assert probe.state.body is not None
-        state = dataclasses.replace(probe.state, body=dataclasses.replace(probe.state.body, **body))
+        body = dataclasses.replace(
+            probe.state.body, orientation=orientation, angular_velocity=rate, acceleration=acceleration
+        )
+        state = dataclasses.replace(probe.state, body=body)
         target = behaviour.command(state, 0.0).position_target[joints]
         torso = np.empty(9)
         mujoco.mju_quat2Mat(torso, quaternion)
