@@ -104,7 +104,7 @@ H1 = Humanoid(
 
 
 OF_AN_H1 = pytest.mark.parametrize("recorded", [H1], ids=["h1"], indirect=True)
-"""A G1's 29 joints and longer multisine take four times an H1's minute."""
+"""A G1's calibration, of 29 joints and a longer multisine, takes more than three minutes."""
 
 
 @pytest.fixture(scope="module", params=[G1, H1], ids=lambda robot: robot.name)
