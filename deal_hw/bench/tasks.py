@@ -256,10 +256,13 @@ def _simulated(ask: _Ask, task: str, settle_s: float = SETTLE_S) -> Case:
 def _go2(ask: _Ask) -> Case:
     from deal_hw.drivers.go2.descriptions import floor
     from deal_hw.drivers.go2.motions import FEET, sway
+    from deal_hw.robots import driver_description
 
     if ask.profile == "realistic":
         raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
-    robot = load_model(floor.DESCRIPTION)
+    # `deal-hw train go2` makes policies for the driver's limits; the shipped one is of half the motors' effort.
+    description = driver_description("go2") if ask.checkpoint else floor.DESCRIPTION
+    robot = load_model(description)
     sensing = TargetSensing(
         joint_std=floor.DESCRIPTION.sensor.noise,
         joint_resolution=floor.DESCRIPTION.sensor.resolution,
@@ -271,7 +274,7 @@ def _go2(ask: _Ask) -> Case:
     def motions(rng: np.random.Generator) -> tuple[Behaviour, Behaviour]:
         fast = sway(robot, rng, DEMONSTRATION_S, (1.5, 4.0))
         if ask.by_policy:
-            return _policy("go2", floor.DESCRIPTION, ask.checkpoint), fast
+            return _policy("go2", description, ask.checkpoint), fast
         return sway(robot, rng, ask.seconds), fast
 
     space = ask.ranges(floor.SPACES)

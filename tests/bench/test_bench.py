@@ -26,7 +26,7 @@ from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.errors import CalibrationError, ConfigurationError, DatasetError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine import warp_support
-from deal_hw.workflows.shipped import shipped_policy
+from deal_hw.workflows.shipped import required_policy, shipped_policy
 
 FIELDS = {
     "bench",
@@ -286,6 +286,14 @@ def test_a_bench_of_another_demonstration_is_not_taken_for_done() -> None:
         calibration.make_cells(Paper(seeds=(3,), demonstration_seconds=seconds)) for seconds in (2.0, 4.0)
     )
     assert short.key != long.key
+
+
+def test_a_policy_of_train_demonstrates_with_a_go2() -> None:
+    """It asks for the motors' whole effort, which the driver's limits allow; at 0.4 m/s it walks for 4 s."""
+    walk = required_policy("go2")
+    case = make_case("go2", "ideal", 1000, 1.5, centred=True, by_policy=True, checkpoint=walk)
+    position, _ = case.fit_truth
+    assert 1.2 < position[-1, 0] - position[0, 0] < 2.4
 
 
 def test_a_checkpoint_demonstrates_and_names_its_rows(tmp_path: Path) -> None:
