@@ -17,6 +17,7 @@ from deal_hw.calib.validation.wider_models import MOST_FORCE, motion
 from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.laws import STRIBECK_SPEED
+from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
 
 MOST_PLAY = 0.5
 """Widest play, as a share of the commands' span [-]."""
@@ -66,7 +67,8 @@ class Explanation:
 
 
 def _play(problem: Problem) -> list[Parameter]:
-    if problem.robot.description.actuation != "position" or _searched(problem, "servo_play"):
+    here = any(_searched(problem, kind) for kind in ("servo_play", TRANSMISSION_STIFFNESS))
+    if problem.robot.description.actuation != "position" or here:
         return []
     span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
     return [

@@ -23,12 +23,14 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.batch import COMMAND_DELAY, command_laws
 from deal_hw.sim.engine.model import command_scale, drop_filters, filters_of
 from deal_hw.sim.engine.step_laws import StepLaws
+from deal_hw.sim.engine.transmission import take_constant_torques
 from deal_hw.sim.laws.setpoints import delay, slew
 from deal_hw.sim.mjcf.calibrated import LATENCY_NUMERIC, custom_name
 from deal_hw.sim.parameters import DEVICE_KINDS, KIND_TABLE
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
 from deal_hw.sim.parameters.sensor import ENCODER_BIAS, ENCODER_SCALE
+from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
 from deal_hw.sim.parameters.values import spread
 from deal_hw.types import FloatArray
 
@@ -76,6 +78,7 @@ class ActuatorLaws:
         model.actuator_gainprm[:, 0] *= gain
         model.actuator_biasprm[:, 1] *= gain
         model.actuator_biasprm[:, 2] *= gain
+        take_constant_torques(model, [name for name, _ in values.get(TRANSMISSION_STIFFNESS, ())])
         self._laws = StepLaws.of(ModelFields(model, model), lambda name: getattr(data, name)[None], values)
         self._path = np.zeros((1, int(np.ceil(self._lag.max(initial=0.0))) + 2, model.nu))
         self._memory = np.zeros((1, 2, model.nu))
@@ -87,6 +90,8 @@ class ActuatorLaws:
         self._path[:] = held[:, None]
         self._memory = self._commands.memory(held)
         self._began = False
+        if self._laws is not None:
+            self._laws.restart()
 
     def step(self, command: npt.ArrayLike) -> None:
         """Advance by one physics step with a command, (A,), as it is sent to the robot."""
@@ -106,6 +111,8 @@ class ActuatorLaws:
             self._laws.write()
         self._began = True
         mujoco.mj_step(self._model, self._data)
+        if self._laws is not None:
+            self._laws.follow()
 
     def reported(self) -> FloatArray:
         """Return the positions of all hinges and slides as their encoders report them, (J,) [rad or m]."""

@@ -45,6 +45,13 @@ def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> Flo
         {"dof_friction_stribeck": 0.2, "dof_stribeck_speed": 0.3, "command_lag": 0.02},
         {"dof_friction_load": 0.1, "servo_play": 0.03, "motor_free_speed": 2.5},
         {"servo_dead_zone": 0.02, "servo_punch": 0.1, "dof_friction_load": 0.1, "encoder_scale": 1.1},
+        {
+            "transmission_stiffness": 60.0,
+            "transmission_damping": 0.1,
+            "transmission_play": 0.01,
+            "dof_friction_load": 0.1,
+            "encoder_scale": 1.1,
+        },
         {"servo_resolution": 0.01, "servo_speed_limit": 1.0, "encoder_bias": 0.05},
         {"servo_speed_limit": 1.0, "command_delay": 0.005, "encoder_scale": 1.1, "encoder_bias": 0.05},
     ],
@@ -70,8 +77,9 @@ def test_a_loop_with_the_laws_moves_as_the_calibration(tmp_path: Path, kinds: di
 
 
 def test_motors_have_their_laws_too(tmp_path: Path) -> None:
-    """Dead zone, asymmetry and saturation of a wheel's commands."""
+    """Dead zone, asymmetry and saturation of a wheel's commands, and a spring behind its motor."""
     laws = {"command_dead_zone": 0.1, "command_asymmetry": 0.2, "command_saturation": 0.4}
+    laws |= {"transmission_stiffness": 30.0, "transmission_play": 0.02}
     members = batch(robot(tmp_path, MOTOR), *(known(kind, "wheel", v) for kind, v in laws.items()))
     path = swing(300, 1)
     found = moved(calibrated(tmp_path, members), path[0], np.zeros(1))

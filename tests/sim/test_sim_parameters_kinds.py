@@ -24,6 +24,7 @@ from deal_hw.sim.parameters import (
 from deal_hw.sim.parameters.fields import BatchFields, ModelFields
 from deal_hw.sim.parameters.geom import bounce, damping_ratio, restitution_of
 from deal_hw.sim.parameters.laws import FRICTION_KINDS, SERVO_LAW_KINDS
+from deal_hw.sim.parameters.transmission import TRANSMISSION_KINDS
 
 MJCF = """
 <mujoco>
@@ -347,6 +348,7 @@ def test_unknown_kind_names_the_nearest() -> None:
         *COMMAND_KINDS,
         *FRICTION_KINDS,
         *SERVO_LAW_KINDS,
+        *(kind.name for kind in TRANSMISSION_KINDS),
         "effort_gain",
         "effort_bias",
         "effort_delay",

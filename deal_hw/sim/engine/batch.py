@@ -24,9 +24,11 @@ from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, drop_filters
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
+from deal_hw.sim.engine.transmission import check_engine, take_constant_torques
 from deal_hw.sim.laws.commands import NEUTRAL, CommandLaws, Filters
 from deal_hw.sim.parameters import SERVO_KINDS, apply_parameters
 from deal_hw.sim.parameters.sensor import ENCODER_BIAS, ENCODER_SCALE
+from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
 from deal_hw.sim.parameters.values import KindValues, spread, values_by_kind
 from deal_hw.types import FloatArray
 
@@ -141,6 +143,11 @@ class ServoBatch:
             # Windows begin with positions and velocities: the filters' states follow from the commands.
             model = copy.copy(model)
             drop_filters(model)
+        sprung = [e for p in self._here.parameters if p.kind == TRANSMISSION_STIFFNESS for e in p.elements]
+        if sprung:
+            check_engine(space, engine)
+            model = copy.copy(model)
+            take_constant_torques(model, sprung)
         self.engine = make_engine(engine, model, robot.model, count, threads or default_threads())
         self.batch = self.engine.batch
         self._fields = self.engine.fields
@@ -250,7 +257,7 @@ class ServoBatch:
         if self.robot.description.actuation != "position":
             return
         if self._steps is not None:
-            self._steps.restore_limits()
+            self._steps.restore_sent()
         gain, bias = self._fields.get("actuator_gainprm"), self._fields.get("actuator_biasprm")
         force = self._fields.get("actuator_forcerange")
         kp, kd = self._act("servo_stiffness", stiffness), self._act("servo_damping", damping)
@@ -299,6 +306,8 @@ class ServoBatch:
         self._qpos[rows], self._qvel[rows] = qpos[:, 0], qvel[:, 0]
         # A warm start from another episode would make results depend on history in the last digits.
         self._warmstart[rows] = 0.0
+        if self._steps is not None:
+            self._steps.restart(rows)
 
     @property
     def position(self) -> FloatArray:

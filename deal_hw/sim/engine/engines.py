@@ -123,6 +123,8 @@ class MujocoEngine:
         found = []
         for g in range(control.shape[1]):
             qpos[:], qvel[:], warm[:] = start[0][:, g], start[1][:, g], 0.0
+            if laws is not None:
+                laws.restart()
             found.append(self._roll(control[:, g], spec, recorded, laws))
         records = {name: np.stack([record[name] for record, _ in found], axis=1) for name in recorded}
         return records, np.stack([bad for _, bad in found], axis=1)

@@ -1,8 +1,9 @@
-"""Laws that act between the engine's steps: friction by speed and load, effort by speed, servos' firmware.
+"""Laws that act between the engine's steps: friction, effort by speed, servos' firmware, transmissions.
 
 Before each step friction, effort limits and constant efforts are written into the model's fields, from the
 state at the beginning of the step and the torques during the step before. MuJoCo solves friction as a
-constraint, so a joint that friction holds stays at rest, with any step.
+constraint, so a joint that friction holds stays at rest, with any step. Rotors of elastic transmissions move
+after each step.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from typing import TypeAlias
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 from mujoco.batch import Batch
 
 from deal_hw.sim.engine.servo_firmware import ServoFirmware
+from deal_hw.sim.engine.transmission import Transmissions
 from deal_hw.sim.laws.friction import FrictionLaw
 from deal_hw.sim.laws.motor import effort_range
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
@@ -41,9 +44,11 @@ class StepLaws:
         actuator: Actuators with a speed without load, B of them.
         free_speed: These speeds, (N, B) [rad/s or m/s].
         firmware: What servos make of the errors of their positions; None for servos without such a law.
+        transmissions: Springs between motors and links; None without any.
 
     Attributes:
         firmware: The same.
+        transmissions: The same.
     """
 
     def __init__(
@@ -55,11 +60,12 @@ class StepLaws:
         actuator: list[int],
         free_speed: FloatArray,
         firmware: ServoFirmware | None = None,
+        transmissions: Transmissions | None = None,
     ) -> None:
         model = self._model = fields.model
         driven = [int(model.jnt_dofadr[model.actuator_trnid[a, 0]]) for a in actuator]
         self._dof, self._actuator, self._driven = as_slice(dof), as_slice(actuator), as_slice(driven)
-        self._free_speed, self.firmware = free_speed, firmware
+        self._free_speed, self.firmware, self.transmissions = free_speed, firmware, transmissions
         # An actuator behind a negative gear turns the other way than its joint.
         self._turns = np.sign(model.actuator_gear[actuator, 0])
         self._friction: FrictionLaw | None = None
@@ -86,7 +92,8 @@ class StepLaws:
                 found.setdefault(dof, {}).update(dict.fromkeys(coefficients, value))
         free = {element_id(model, "actuator", name): value for name, value in values.get(FREE_SPEED, ())}
         firmware = ServoFirmware.of(fields, outputs, values)
-        if not found and not free and firmware is None:
+        transmissions = Transmissions.of(fields, outputs, values)
+        if not found and not free and firmware is None and transmissions is None:
             return None
         count = len(outputs("qvel"))
         friction = {
@@ -94,7 +101,7 @@ class StepLaws:
             for name, neutral in COEFFICIENTS.items()
         }
         speeds = _columns(list(free.values()), count)
-        return cls(fields, outputs, list(found), friction, list(free), speeds, firmware)
+        return cls(fields, outputs, list(found), friction, list(free), speeds, firmware, transmissions)
 
     @property
     def friction(self) -> FrictionLaw | None:
@@ -140,12 +147,16 @@ class StepLaws:
             self._range[:, self._actuator] = self._model.actuator_forcerange[self._actuator]
         if self.firmware is not None:
             self.firmware.restore()
+        if self.transmissions is not None:
+            self.transmissions.restore()
 
-    def restore_limits(self) -> None:
-        """Write the effort limits at standstill where the law has written."""
+    def restore_sent(self) -> None:
+        """Write the gains, and the effort limits at standstill, where laws have written."""
         if self._limited:
             self._range[:, self._actuator, 0] = -self._stall
             self._range[:, self._actuator, 1] = self._stall
+        if self.transmissions is not None:
+            self.transmissions.restore_sent()
 
     def read_sent(self) -> None:
         """Take effort limits in the fields as those at standstill, and gains of servos as those that act."""
@@ -153,6 +164,13 @@ class StepLaws:
             self._read_limits()
         if self.firmware is not None:
             self.firmware.read_gains()
+        if self.transmissions is not None:
+            self.transmissions.read_sent()
+
+    def restart(self, where: npt.NDArray[np.intp] | slice = slice(None)) -> None:
+        """Forget what laws keep from step to step, of the members in ``where``, whose states are new."""
+        if self.transmissions is not None:
+            self.transmissions.restart(where)
 
     def _read_limits(self) -> None:
         self._stall = self._range[:, self._actuator, 1].copy()
@@ -163,11 +181,15 @@ class StepLaws:
         Args:
             forward: Computes the torques of all simulations.
         """
-        if not self.loaded:
+        fresh = self.transmissions if self.transmissions and self.transmissions.beginning else None
+        if not self.loaded and fresh is None:
             return
         if self.firmware is not None:
             self.firmware.write()
-        forward()
+        if fresh is None:
+            forward()
+        else:
+            fresh.begin(forward)
 
     def write(self) -> None:
         """Write friction, limits and the servos' efforts for the next step, whose controls are set."""
@@ -183,6 +205,13 @@ class StepLaws:
             self._range[:, self._actuator, 0], self._range[:, self._actuator, 1] = low, high
         if self.firmware is not None:
             self.firmware.write()
+        if self.transmissions is not None:
+            self.transmissions.write()
+
+    def follow(self) -> None:
+        """Move what laws keep from step to step, after the engine's step."""
+        if self.transmissions is not None:
+            self.transmissions.follow()
 
 
 def rollout(
@@ -214,6 +243,7 @@ def rollout(
         if pushed:
             applied[:] = control[:, step, nu:]
         batch.step()
+        laws.follow()
         for name, field in fields.items():
             record[name][:, step] = field
     return record

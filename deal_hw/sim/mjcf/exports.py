@@ -27,6 +27,7 @@ from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.inertia import INERTIA_KINDS
 from deal_hw.sim.parameters.laws import FREE_SPEED, LAW_KINDS
+from deal_hw.sim.parameters.transmission import TRANSMISSION_KINDS
 
 ACTUATORS = "actuators.yaml"
 URDF = "urdf.yaml"
@@ -272,7 +273,8 @@ def plain_values(result: CalibrationResult) -> dict[str, Any]:
 
 def laws_without_a_field(result: CalibrationResult) -> list[str]:
     """Return the names of calibrated laws that neither Isaac Lab, nor mjlab, nor a URDF can express."""
-    kinds = {*(kind.name for kind in LAW_KINDS), *COMMAND_KINDS} - {FREE_SPEED}
+    laws = (*LAW_KINDS, *TRANSMISSION_KINDS)
+    kinds = {*(kind.name for kind in laws), *COMMAND_KINDS} - {FREE_SPEED}
     return [p.name for p in result.space.parameters if p.kind in kinds]
 
 

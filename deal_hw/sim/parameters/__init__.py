@@ -26,6 +26,7 @@ from deal_hw.sim.parameters.kind import Apply, Kind, Together
 from deal_hw.sim.parameters.laws import LAW_KINDS, SERVO_RESOLUTION, check_laws
 from deal_hw.sim.parameters.sensor import SENSOR_KINDS
 from deal_hw.sim.parameters.tendon import TENDON_KINDS
+from deal_hw.sim.parameters.transmission import TRANSMISSION_KINDS, check_transmissions
 
 KIND_TABLE: Mapping[str, Kind] = MappingProxyType(
     {
@@ -38,6 +39,7 @@ KIND_TABLE: Mapping[str, Kind] = MappingProxyType(
             *GEOM_KINDS,
             *ACTUATOR_KINDS,
             *LAW_KINDS,
+            *TRANSMISSION_KINDS,
             *SENSOR_KINDS,
             *EFFORT_KINDS,
         )
@@ -136,6 +138,7 @@ def check_space(model: Any, space: ParameterSpace) -> None:
                 )
         if p.kind in ("geom_friction", "geom_restitution"):
             check_partners(model, p.kind, p.elements, p.low)
+    check_transmissions(model, space)
     for (name, element), first in owner.items():
         for other in KIND_TABLE[name].excludes:
             if (other, element) in owner:

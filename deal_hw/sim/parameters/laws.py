@@ -80,10 +80,24 @@ def _error_known(model: Any, actuator: int, name: str) -> None:
             f"actuator {name!r} is no position servo, so it compares no position with a goal; for a motor "
             "use command_dead_zone"
         )
+    check_integrator(model, "the effort of a servo", ", and its firmware does not")
+
+
+def check_integrator(model: Any, effort: str, but: str = "") -> None:
+    """Refuse integrators that change an effort within a step.
+
+    Args:
+        model: The MjModel.
+        effort: The effort, in words.
+        but: What does not change within it, in words.
+
+    Raises:
+        ConfigurationError: Such an integrator; the message names those that hold efforts.
+    """
     used = mujoco.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_")
     if used not in {name.upper() for name in _INTEGRATORS}:
         raise ConfigurationError(
-            f"the integrator {used} changes the effort of a servo within a step, and its firmware does not; "
+            f"the integrator {used} changes {effort} within a step{but}; "
             f'write <option integrator="..."/> with one of {", ".join(_INTEGRATORS)}'
         )
 

@@ -1,0 +1,218 @@
+"""Elastic transmissions between the engine's steps: rotors that MuJoCo's model does not have.
+
+A joint's ``dof_armature`` is the rotor's inertia. It is taken out of the model, and the rotor gets an angle
+and a speed of its own. The actuator's gains, constant effort and limit give the motor's torque: from the
+position of the link, where the encoder is, and the speed of the motor. In the model the actuator is a
+constant torque, which is written before each step, and the armature is what the link feels of the rotor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.gpu import EngineName
+from deal_hw.sim.laws.transmission import Coupling, TransmissionLaw
+from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
+from deal_hw.sim.parameters.transmission import (
+    TRANSMISSION_DAMPING,
+    TRANSMISSION_PLAY,
+    TRANSMISSION_STIFFNESS,
+)
+from deal_hw.sim.parameters.values import KindValues
+from deal_hw.types import FloatArray
+
+Outputs = Callable[[str], FloatArray]
+
+_FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+
+
+def check_engine(space: ParameterSpace, engine: EngineName) -> None:
+    """Refuse transmissions on MuJoCo Warp.
+
+    Raises:
+        ConfigurationError: The engine is not MuJoCo, and a parameter is a transmission's stiffness.
+    """
+    if engine == "mujoco":
+        return
+    for p in space.parameters:
+        if p.kind == TRANSMISSION_STIFFNESS:
+            raise ConfigurationError(
+                f"MuJoCo Warp does not simulate the elastic transmission of {p.name!r} ({p.kind}); use "
+                "--engine mujoco"
+            )
+
+
+def take_constant_torques(model: mujoco.MjModel, names: Sequence[str]) -> None:
+    """Let actuators add the constant torque of their biasprm, which those without a bias type ignore."""
+    affine = int(mujoco.mjtBias.mjBIAS_AFFINE)
+    for name in names:
+        actuator = element_id(model, "actuator", name)
+        if int(model.actuator_biastype[actuator]) != affine:
+            model.actuator_biastype[actuator] = affine
+            model.actuator_biasprm[actuator] = 0.0
+
+
+class Transmissions:
+    """The transmissions of B actuators of N simulations, with the states of their rotors.
+
+    Args:
+        fields: Their model fields, with the rotors' inertias as armature. The simulated model has been passed
+            to :func:`take_constant_torques`.
+        outputs: Returns the live values of an MjData field, (N, ...).
+        values: Values by kind; each actuator has a stiffness.
+
+    Attributes:
+        angle: Angles of the motors, (N, B) [rad or m].
+        speed: Their speeds, (N, B) [rad/s or m/s].
+    """
+
+    def __init__(self, fields: Fields, outputs: Outputs, values: KindValues) -> None:
+        model = self._model = fields.model
+        given = {
+            kind: dict(values.get(kind, ()))
+            for kind in (TRANSMISSION_STIFFNESS, TRANSMISSION_DAMPING, TRANSMISSION_PLAY)
+        }
+        names = list(given[TRANSMISSION_STIFFNESS])
+        actuator = [element_id(model, "actuator", name) for name in names]
+        joint = model.actuator_trnid[actuator, 0]
+        dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
+        self._actuator, self._dof, self._place = as_slice(actuator), as_slice(dof), as_slice(place)
+        self._qpos, self._qvel = outputs("qpos"), outputs("qvel")
+        self._control, self._torque, self._qacc = outputs("ctrl"), outputs("qfrc_actuator"), outputs("qacc")
+        self._gain, self._bias, self._range = (fields.get(name) for name in _FIELDS)
+        self._armature = fields.get("dof_armature")
+        # MuJoCo takes the inertia of a body that moves alone ("simple") as it was derived, with the armature.
+        self._simple = np.flatnonzero(np.array(model.dof_simplenum)[dof] > 0)
+        self._simple_dof = [dof[k] for k in self._simple]
+        self._derived = fields.get("dof_M0")
+        self._alone = self._derived[:, self._simple_dof] - self._armature[:, self._simple_dof]
+        self._nominal = [np.array(getattr(model, name)[actuator]) for name in _FIELDS]
+        self._nominal[1][model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE] = 0.0
+        shape = len(self._qvel), len(names)
+
+        def of(kind: str) -> FloatArray:
+            found = given[kind]
+            return np.stack([found.get(name, np.zeros(shape[0])) for name in names], axis=1)
+
+        rotor = self._armature[:, self._dof].copy()
+        # Without the rotor, 1/J becomes 1/(J - rotor): that of the other joints' state where they are free.
+        whole = 1 / fields.get("dof_invweight0")[:, self._dof]
+        self.law = TransmissionLaw(
+            stiffness=of(TRANSMISSION_STIFFNESS),
+            damping=of(TRANSMISSION_DAMPING),
+            play=of(TRANSMISSION_PLAY),
+            inertia=rotor,
+            link_inertia=np.maximum(whole - rotor, 1e-6 * whole),
+            step_s=float(model.opt.timestep),
+        )
+        self._gear = np.array(model.actuator_gear[actuator, 0])
+        self._limited = np.array(model.actuator_forcelimited[actuator], dtype=bool)
+        self._control_range = np.where(
+            model.actuator_ctrllimited[actuator], model.actuator_ctrlrange[actuator].T, [[-np.inf], [np.inf]]
+        )
+        self.angle, self.speed = np.zeros(shape), np.zeros(shape)
+        self._fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
+        self._coupling: Coupling | None = None
+        self.read_sent()
+
+    @classmethod
+    def of(cls, fields: Fields, outputs: Outputs, values: KindValues) -> Transmissions | None:
+        """Return the transmissions that values by kind set; None where they set none."""
+        return cls(fields, outputs, values) if TRANSMISSION_STIFFNESS in values else None
+
+    def restart(self, where: npt.NDArray[np.intp] | slice = slice(None)) -> None:
+        """Let rotors of members follow from their states at the next beginning."""
+        self._fresh[where] = True
+
+    def read_sent(self) -> None:
+        """Take gains and limits in the fields as those of the motors, and put the transmissions there."""
+        at = self._actuator
+        self._own = self._gain[:, at, 0].copy(), self._bias[:, at, :3].copy(), self._range[:, at].copy()
+        self._ends = np.sort(self._gear[:, None] * self._own[2], axis=-1)
+        self._ends[:, ~self._limited] = -np.inf, np.inf
+        self._resistance = -self._own[1][..., 2] * self._gear**2
+        self._put()
+
+    def restore_sent(self) -> None:
+        """Write the motors' gains and limits, and the rotors' inertias, where transmissions stand."""
+        at = self._actuator
+        self._gain[:, at, 0], self._bias[:, at, :3], self._range[:, at] = self._own
+        self._put_inertia(self.law.inertia)
+
+    def restore(self) -> None:
+        """Write the model's own values where transmissions stand; derived inertias are as they were."""
+        at = self._actuator
+        self._put_inertia(self.law.inertia)
+        for field, own in zip((self._gain, self._bias, self._range), self._nominal, strict=True):
+            field[:, at] = own
+        self._armature[:, self._dof] = self._model.dof_armature[self._dof]
+
+    def _put(self) -> None:
+        at = self._actuator
+        self._gain[:, at, 0] = 0.0
+        self._bias[:, at, :3] = 0.0
+        self._range[:, at] = -np.inf, np.inf
+
+    def _put_inertia(self, inertia: FloatArray) -> None:
+        """Write what the links have beside their own inertia, (N, B)."""
+        self._armature[:, self._dof] = inertia
+        if self._simple_dof:
+            self._derived[:, self._simple_dof] = self._alone + inertia[:, self._simple]
+
+    @property
+    def beginning(self) -> bool:
+        """Whether any rotor's state follows from its joint's at the next beginning."""
+        return bool(self._fresh.any())
+
+    def begin(self, forward: Callable[[], None]) -> None:
+        """Set the states of fresh rotors: they move with their links, and their springs pass what is needed.
+
+        That is the motor's torque less what accelerates the rotor together with its link.
+
+        Args:
+            forward: Computes torques and accelerations of all simulations.
+        """
+        self.restore_sent()
+        forward()
+        self._put()
+        rows, link = self._fresh, self._qvel[:, self._dof]
+        passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
+        self.speed[rows] = link[rows]
+        self.angle[rows] = (self._qpos[:, self._place] + self.law.deflection(passed))[rows]
+        self._fresh[:] = False
+
+    def write(self) -> None:
+        """Write torques and inertias for the next step, whose controls are set."""
+        link, link_speed = self._qpos[:, self._place], self._qvel[:, self._dof]
+        gain, bias, _ = self._own
+        control = np.clip(self._control[:, self._actuator], *self._control_range)
+        # A member that diverged has no numbers, and is found by the engine.
+        with np.errstate(over="ignore", invalid="ignore"):
+            force = gain * control + bias[..., 0] + bias[..., 1] * self._gear * link
+            standing = self._gear * force
+            torque = standing - self._resistance * self.speed
+            held = np.clip(torque, self._ends[..., 0], self._ends[..., 1])
+            able = held == torque
+            coupling = self.law.couple(
+                self.angle - link,
+                self.speed,
+                link_speed,
+                np.where(able, standing, held),
+                np.where(able, self._resistance, 0.0),
+            )
+        self._bias[:, self._actuator, 0] = coupling.torque / self._gear
+        self._put_inertia(coupling.inertia)
+        self._coupling = coupling
+
+    def follow(self) -> None:
+        """Move the rotors by the step that the engine has done."""
+        if self._coupling is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                self.speed = self._coupling.motor_speed(self._qvel[:, self._dof])
+                self.angle = self.angle + self.law.step_s * self.speed

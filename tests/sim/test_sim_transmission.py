@@ -1,0 +1,382 @@
+"""Elastic transmissions: by hand, beside two bodies with a tendon, stiff springs, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from fakes.law_robots import MOTOR, SERVO, batch, known, robot, swing
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.closed_loop import ClosedLoop
+from deal_hw.sim.engine.step_laws import StepLaws
+from deal_hw.sim.engine.transmission import Transmissions, take_constant_torques
+from deal_hw.sim.laws.transmission import TransmissionLaw
+from deal_hw.sim.parameters import check_space
+from deal_hw.sim.parameters.fields import ModelFields
+
+ROTOR, LINK = 0.02, 0.01
+"""Inertias of the plate's motor and of the plate [kg·m²]: 1.5 kg / 3 (0.1² + 0.1²) m²."""
+
+PLATE = """
+<mujoco><option timestep="{step}" integrator="{integrator}" gravity="0 0 0"/><worldbody>
+<body><joint name="plate" axis="0 1 0" armature="0.02"/><geom type="box" size=".1 .01 .1" mass="1.5"/></body>
+</worldbody><actuator><motor name="plate" joint="plate"/></actuator></mujoco>"""
+
+PENDULUM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body><joint name="arm" axis="0 1 0" armature="0.02" damping="0.2"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4"/></body>
+</worldbody><actuator>{actuator}</actuator></mujoco>"""
+
+TORQUE = '<motor name="arm" joint="arm"/>'
+POSITION = '<position name="arm" joint="arm" kp="{kp}" kv="0.6" forcerange="-2 2"/>'
+
+TWO_BODIES = """
+<mujoco><option timestep="0.0001" integrator="implicitfast"/><worldbody>
+<body><joint name="arm" axis="0 1 0" damping="0.2"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4"/></body>
+<body><joint name="rotor" axis="0 1 0" armature="0.02"/><geom size=".01" mass="1e-6"/></body>
+</worldbody><tendon><fixed stiffness="{stiffness}" damping="{damping}" springlength="{low} {high}">
+<joint joint="rotor" coef="1"/><joint joint="arm" coef="-1"/></fixed></tendon>
+<actuator><motor name="rotor" joint="rotor"/></actuator></mujoco>"""
+
+
+class Loop:
+    """One model in a loop of mj_step with the laws between the steps."""
+
+    def __init__(self, text: str, **kinds: float) -> None:
+        model = self.model = mujoco.MjModel.from_xml_string(text)
+        self.data = mujoco.MjData(model)
+        name = model.actuator(0).name
+        take_constant_torques(model, [name])
+        values = {f"transmission_{kind}": [(name, np.array([value]))] for kind, value in kinds.items()}
+        laws = StepLaws.of(ModelFields(model, model), lambda field: getattr(self.data, field)[None], values)
+        assert laws is not None and laws.transmissions is not None
+        self._laws, self.rotor = laws, laws.transmissions
+        self._begun = False
+
+    def begin(self) -> Transmissions:
+        """Let the rotor's state follow from the link's; return it."""
+        self._laws.begin(lambda: mujoco.mj_forward(self.model, self.data))
+        self._begun = True
+        return self.rotor
+
+    def step(self, control: float) -> None:
+        """Do one step."""
+        self.data.ctrl[0] = control
+        if not self._begun:
+            self.begin()
+        self._laws.write()
+        mujoco.mj_step(self.model, self.data)
+        self._laws.follow()
+
+
+def plate(stiffness: float, step: float = 0.002, integrator: str = "implicitfast", **kinds: float) -> Loop:
+    """Return the plate without gravity."""
+    return Loop(PLATE.format(step=step, integrator=integrator), stiffness=stiffness, **kinds)
+
+
+def law(**parts: float) -> TransmissionLaw:
+    """Return the law of one joint with a step of 1 ms."""
+    every = {"stiffness": 100.0, "damping": 0.0, "play": 0.0, "inertia": 0.02, "link_inertia": 0.01} | parts
+    return TransmissionLaw(**{name: np.array([[value]]) for name, value in every.items()}, step_s=0.001)
+
+
+def coupled(of: TransmissionLaw, *state: float) -> list[float]:
+    """Return torque, inertia, own speed and the share that follows, of one joint."""
+    found = of.couple(*(np.array([[value]]) for value in state))
+    parts = found.torque, found.inertia, found.own_speed, found.follows
+    return [float(part[0, 0]) for part in parts]
+
+
+def test_a_soft_spring_by_hand() -> None:
+    """100 N·m/rad, bent by 0.03 rad: 3 N·m; the rotor, 1 rad/s, loses 3 N·m and gains 2 N·m for 1 ms."""
+    speed = 1.0 + (2.0 - 3.0) * 0.001 / 0.02
+    assert coupled(law(), 0.03, 1.0, 0.5, 2.0, 0.0) == pytest.approx([3.0, 0.0, speed, 0.0])
+
+
+def test_a_damper_by_hand() -> None:
+    """0.5 N·m·s/rad: the rotor, 0.02 kg·m² in 1 ms, is 20 N·m·s/rad, so 0.5/20.5 of the link's speed adds."""
+    torque, inertia, speed, follows = coupled(law(damping=0.5), 0.03, 1.0, 0.5, 2.0, 0.0)
+    assert follows == pytest.approx(0.5 / 20.5)
+    assert speed == pytest.approx((20.0 + 2.0 - 3.0) / 20.5)
+    # The damper passes 0.5 times the difference of speeds at the end, with the link's as it is.
+    assert torque == pytest.approx(3.0 + 0.5 * (speed + follows * 0.5 - 0.5))
+    assert inertia == pytest.approx(0.001 * 0.5 * 20 / 20.5)
+
+
+def test_a_stiff_spring_adds_the_rotor_to_the_link() -> None:
+    """1e9 N·m/rad: the link has 0.02 kg·m² more, and 1 ms of the motor's 3 N·m·s/rad."""
+    torque, inertia, speed, follows = coupled(law(stiffness=1e9), 0.0, 0.5, 0.5, 2.0, 3.0)
+    assert inertia == pytest.approx(0.02 + 0.003, rel=1e-4)
+    assert torque == pytest.approx(2.0 - 3.0 * 0.5, rel=1e-4)
+    assert [speed, follows] == pytest.approx([0.0, 1.0], abs=1e-4)
+
+
+def test_a_gap_by_hand() -> None:
+    """A gap of 0.04 rad: nothing at 0.019 rad, 100 N·m/rad beyond 0.02 rad to either side."""
+    of = law(play=0.04)
+    assert coupled(of, 0.019, 1.0, 0.0, 2.0, 0.0) == pytest.approx([0.0, 0.0, 1.1, 0.0])
+    assert coupled(of, 0.05, 0.0, 0.0, 0.0, 0.0)[0] == pytest.approx(3.0)
+    assert coupled(of, -0.05, 0.0, 0.0, 0.0, 0.0)[0] == pytest.approx(-3.0)
+    assert of.deflection(np.array([[-3.0]]))[0, 0] == pytest.approx(-0.05)
+
+
+@pytest.mark.parametrize("play", [0.0, 0.05])
+def test_deflection_at_rest_is_torque_over_stiffness(play: float) -> None:
+    """A pendulum of 0.4 kg, 0.15 m, held by 0.3 N·m at 20 N·m/rad: 0.015 rad, and half of the gap."""
+    loop = Loop(PENDULUM.format(actuator=TORQUE), stiffness=20.0, damping=0.1, play=play)
+    for _ in range(5000):
+        loop.step(0.3)
+    link = float(loop.data.qpos[0])
+    assert math.sin(link) == pytest.approx(0.3 / (0.4 * 9.81 * 0.15), rel=1e-4)
+    assert loop.rotor.angle[0, 0] - link == pytest.approx(0.3 / 20 + play / 2, rel=1e-4)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicit", "implicitfast"])
+@pytest.mark.parametrize("stiffness", [10.0, 100.0, 700.0])
+def test_frequency_of_a_free_oscillation(integrator: str, stiffness: float) -> None:
+    """Root of k (1/J + 1/Jl) to 2 %, up to 51 Hz at 2 ms; nothing damps it, and momentum stays 0."""
+    loop = plate(stiffness, integrator=integrator)
+    loop.data.qvel[0] = 1.0
+    loop.begin().speed[:] = -LINK / ROTOR
+    speed = np.empty(4000)
+    for step in range(len(speed)):
+        loop.step(0.0)
+        speed[step] = loop.data.qvel[0]
+    turns = np.flatnonzero(np.diff(np.sign(speed)))
+    period = 2 * 0.002 * (turns[-1] - turns[0]) / (len(turns) - 1)
+    assert 2 * math.pi / period == pytest.approx(math.sqrt(stiffness * (1 / ROTOR + 1 / LINK)), rel=0.02)
+    assert np.abs(speed[-500:]).max() == pytest.approx(1.0, rel=0.06)
+    assert LINK * speed[-1] + ROTOR * loop.rotor.speed[0, 0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_gap_passes_no_torque() -> None:
+    """The motor turns from one end of the gap towards the other: the link stays, to the last bit."""
+    loop = plate(1e4, play=0.1)
+    # Without a torque it begins in the middle.
+    loop.begin()
+    for step in range(30):
+        loop.step(0.4 if step < 15 else -0.4)
+        assert loop.data.qpos[0] == 0.0 == loop.data.qvel[0] == loop.data.qfrc_actuator[0]
+    # 0.4 N·m on 0.02 kg·m² are 20 rad/s², for 15 steps forth and 15 back.
+    assert loop.rotor.angle[0, 0] == pytest.approx(15**2 * 0.002**2 * 20, rel=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    stiffness=st.floats(1.0, 1e5),
+    step=st.sampled_from([0.002, 0.005]),
+    integrator=st.sampled_from(["Euler", "implicit", "implicitfast"]),
+    damping=st.sampled_from([0.0, 0.01, 1.0, 100.0]),
+    play=st.sampled_from([0.0, 0.002, 0.05]),
+)
+def test_no_spring_blows_up(
+    stiffness: float, step: float, integrator: str, damping: float, play: float
+) -> None:
+    """Bodies that hit each other at 3 rad/s never move much faster than that, and momentum stays."""
+    loop = plate(stiffness, step, integrator, damping=damping, play=play)
+    loop.data.qvel[0] = 1.0
+    loop.begin().speed[:] = -2.0
+    momentum = LINK * 1.0 - ROTOR * 2.0
+    for _ in range(300):
+        loop.step(0.0)
+        assert abs(loop.data.qvel[0] - loop.rotor.speed[0, 0]) < 1.5 * 3.0
+    total = LINK * loop.data.qvel[0] + ROTOR * loop.rotor.speed[0, 0]
+    assert total == pytest.approx(momentum, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "play", "tolerance"),
+    [(20.0, 0.05, 0.0, 0.004), (200.0, 0.2, 0.0, 0.004), (200.0, 0.0, 0.03, 0.004), (1e4, 1.0, 0.0, 0.004)],
+)
+def test_motion_is_that_of_two_bodies(
+    stiffness: float, damping: float, play: float, tolerance: float
+) -> None:
+    """MuJoCo's own rotor, link and tendon at 0.1 ms, under the same torques, within a share of the motion."""
+    loop = Loop(PENDULUM.format(actuator=TORQUE), stiffness=stiffness, damping=damping, play=play)
+    ends = {"low": -play / 2, "high": play / 2}
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES.format(stiffness=stiffness, damping=damping, **ends))
+    data = mujoco.MjData(model)
+    found, expected = np.empty((2, 1000)), np.empty((2, 1000))
+    loop.begin()
+    for step in range(1000):
+        torque = 0.5 * math.sin(2 * math.pi * 0.9 * 0.002 * step) + 0.1
+        loop.step(torque)
+        data.ctrl[0] = torque
+        mujoco.mj_step(model, data, 20)
+        found[:, step] = loop.data.qpos[0], loop.rotor.angle[0, 0]
+        expected[:, step] = data.qpos
+    assert np.all(np.abs(found - expected).max(axis=1) < tolerance * np.ptp(expected, axis=1))
+
+
+@pytest.mark.parametrize("limit", [10.0, 0.7])
+def test_a_servo_reads_the_link_and_is_damped_at_the_motor(limit: float) -> None:
+    """Two bodies: 15 N·m/rad of the link's error, 0.6 N·m·s/rad of the motor's speed, then the limit."""
+    text = POSITION.format(kp=15).replace("-2 2", f"-{limit} {limit}")
+    loop = Loop(PENDULUM.format(actuator=text), stiffness=60.0, damping=0.05)
+    model = mujoco.MjModel.from_xml_string(TWO_BODIES.format(stiffness=60, damping=0.05, low=0, high=0))
+    data = mujoco.MjData(model)
+    found, expected = np.empty((2, 800)), np.empty((2, 800))
+    for step in range(800):
+        goal = 0.5 * math.sin(2 * math.pi * 1.2 * 0.002 * step)
+        loop.step(goal)
+        for _ in range(20):
+            torque = 15 * (goal - data.qpos[0]) - 0.6 * data.qvel[1]
+            data.ctrl[0] = min(max(torque, -limit), limit)
+            mujoco.mj_step(model, data)
+        found[:, step] = loop.data.qpos[0], loop.rotor.angle[0, 0]
+        expected[:, step] = data.qpos
+    np.testing.assert_allclose(found, expected, atol=0.01 * np.ptp(expected))
+    assert np.ptp(expected[1] - expected[0]) > 0.01
+
+
+@pytest.mark.parametrize("stiffness", [1e5, 1e8])
+def test_a_stiff_transmission_moves_as_the_rigid_model(tmp_path: Path, stiffness: float) -> None:
+    """Two servos with friction and limits, to 0.3 mrad of 1 rad."""
+    model = robot(tmp_path, SERVO)
+    path = swing(500, 2)
+    springs = [known("transmission_stiffness", name, stiffness) for name in ("shoulder", "elbow")]
+    runs = []
+    for members in (batch(model), batch(model, *springs)):
+        members.set_state(np.array([0.2, -0.1]), np.zeros(2))
+        runs.append(members.advance(path, every=1)[0])
+    np.testing.assert_allclose(runs[1], runs[0], atol=3e-4)
+
+
+SPRING = {"transmission_stiffness": 60.0, "transmission_damping": 0.1, "transmission_play": 0.01}
+
+
+def sprung(tmp_path: Path, count: int = 1, text: str = SERVO, name: str = "shoulder") -> ServoBatch:
+    """Return members with an elastic transmission."""
+    return batch(robot(tmp_path, text), *(known(kind, name, v) for kind, v in SPRING.items()), count=count)
+
+
+@pytest.mark.parametrize(("text", "name"), [(SERVO, "shoulder"), (MOTOR, "wheel")], ids=["servo", "motor"])
+def test_a_window_does_not_depend_on_the_one_before(tmp_path: Path, text: str, name: str) -> None:
+    """States that are set anew have rotors that follow from them, also in windows and with new values."""
+    members = sprung(tmp_path, 2, text, name)
+    joints = 2 if text == SERVO else 1
+    start, path = np.full(joints, 0.2), np.repeat(swing(200, joints), 2, axis=0)
+    runs = []
+    for before in (0, 130):
+        if before:
+            members.set_parameters(np.array([[0.3], [0.4]]))
+            members.set_state(np.full(joints, 1.0), np.full(joints, 3.0))
+            members.advance(np.repeat(swing(before, joints), 2, axis=0))
+        members.set_parameters(np.array([[0.05], [0.06]]))
+        members.set_state(start, np.zeros(joints))
+        runs.append(members.advance(path, every=10)[0])
+    np.testing.assert_array_equal(runs[0], runs[1])
+    starts = np.broadcast_to(start, (2, 2, joints)), np.zeros((2, 2, joints))
+    windows, _ = members.advance_windows(starts, np.repeat(path[:, None], 2, axis=1), 10)
+    np.testing.assert_array_equal(windows, np.stack([runs[0], runs[0]], axis=1))
+
+
+def test_rotors_go_on_from_one_control_period_to_the_next(tmp_path: Path) -> None:
+    """Twenty periods of a closed loop are one path, also where the other member begins anew within it."""
+    members, whole = sprung(tmp_path, 2), sprung(tmp_path, 2)
+    targets = np.repeat(swing(200, 2)[:, ::10], 2, axis=0)
+    for each in (members, whole):
+        each.set_state(np.full(2, 0.1), np.zeros(2))
+    expected, _ = whole.advance(np.repeat(targets, 10, axis=1), every=10)
+    loop = ClosedLoop(members, 10)
+    loop.restart(np.zeros((2, 2)), np.zeros(2))
+    found = []
+    for k in range(20):
+        if k == 12:
+            members.set_state(np.full(2, 0.1), np.zeros(2), np.array([1]))
+        found.append(loop.advance(targets[:, k])[0][:, 0])
+    np.testing.assert_allclose(np.stack(found, axis=1)[0], expected[0], atol=1e-12)
+    assert np.abs(np.stack(found, axis=1)[1, 12:] - expected[1, 12:]).max() > 1e-2
+
+
+def test_gains_that_the_host_sends_act_at_the_motor(tmp_path: Path) -> None:
+    """Without gains the arm falls; with them again it moves as before."""
+    members = sprung(tmp_path)
+    runs = []
+    for gain in (20.0, 0.0, 20.0):
+        sent = np.array([gain, 10.0]), np.array([gain / 20, 0.5]), np.array([4.0, 3.0])
+        members.set_sent(*sent)
+        members.set_state(np.array([0.3, 0.0]), np.zeros(2))
+        runs.append(members.advance(np.zeros((1, 300, 2)), every=300)[0][0, 0, 0])
+    assert runs[0] == runs[2] and abs(runs[0] - runs[1]) > 0.05
+
+
+def space(*given: tuple[str, str, float] | Parameter) -> ParameterSpace:
+    """Return parameters; those that are known by kind, element and value."""
+    return ParameterSpace([p if isinstance(p, Parameter) else known(*p) for p in given])
+
+
+def rotor(least: float) -> Parameter:
+    """Return the rotor's inertia, which is searched."""
+    return Parameter(
+        name="rotor", kind="dof_armature", elements=("shoulder",), unit="kg·m²", nominal=0.01, low=least,
+        high=1.0, scale="linear",
+    )  # fmt: skip
+
+
+STIFF = ("transmission_stiffness", "shoulder", 100.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "parameters", "message"),
+    [
+        (
+            SERVO.replace('armature="0.01"', ""),
+            space(STIFF),
+            r"'shoulder' needs inertia.*0 in the model; write",
+        ),
+        (SERVO, space(STIFF, rotor(0.0)), r"dof_armature is 0 at its lowest.*range above 0"),
+        (SERVO, space(STIFF, ("servo_play", "shoulder", 1.0)), r"servo_play.*transmission_play is the play"),
+        (
+            SERVO,
+            space(STIFF, ("servo_punch", "shoulder", 1.0)),
+            r"servo_punch.*not simulated behind.*leave it",
+        ),
+        (SERVO, space(STIFF, ("motor_free_speed", "shoulder", 5.0)), r"motor_free_speed.*leave it out"),
+        (SERVO, space(STIFF, ("effort_gain", "shoulder", 1.0)), r"effort_gain.*transmission.*leave one out"),
+        (
+            SERVO,
+            space(("transmission_play", "elbow", 1.0)),
+            r"spring that 'elbow' does not have; add .*kind:",
+        ),
+        (SERVO.replace("implicitfast", "RK4"), space(STIFF), r"RK4 changes the torque of a.*Euler"),
+        (
+            SERVO.replace('kv="1"', 'kv="1" armature="0.01"'),
+            space(STIFF),
+            r"armature of its own; write it as",
+        ),
+        (
+            SERVO.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-3 3"'),
+            space(STIFF),
+            r"as forcerange",
+        ),
+        (
+            SERVO.replace('"elbow" kp', '"shoulder" kp'),
+            space(STIFF),
+            r"2 actuators \('shoulder', 'elbow'\).*one",
+        ),
+    ],
+    ids="no rotor,rotor of 0,play,punch,free speed,effort,no spring,RK4,own armature,joint limit,two".split(
+        ","
+    ),
+)
+def test_what_cannot_be_is_refused(text: str, parameters: ParameterSpace, message: str) -> None:
+    """With what is allowed, and what to do."""
+    with pytest.raises(ConfigurationError, match=message):
+        check_space(mujoco.MjModel.from_xml_string(text), parameters)
+
+
+def test_a_gpu_is_refused(tmp_path: Path) -> None:
+    """Its kernels have no transmissions."""
+    with pytest.raises(ConfigurationError, match=r"not simulate the elastic.*'shoulder.*use --engine mujoco"):
+        ServoBatch(robot(tmp_path, SERVO), space(STIFF, rotor(0.01)), 1, threads=1, engine="warp-cpu")
