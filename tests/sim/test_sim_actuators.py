@@ -51,6 +51,7 @@ def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> Flo
             "transmission_play": 0.01,
             "dof_friction_load": 0.1,
             "encoder_scale": 1.1,
+            "motor_free_speed": 2.5,
         },
         {"servo_resolution": 0.01, "servo_speed_limit": 1.0, "encoder_bias": 0.05},
         {"servo_speed_limit": 1.0, "command_delay": 0.005, "encoder_scale": 1.1, "encoder_bias": 0.05},

@@ -18,6 +18,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.transmission import Transmissions, take_constant_torques
+from deal_hw.sim.engine.warp_support import choose_engine
 from deal_hw.sim.laws.transmission import TransmissionLaw
 from deal_hw.sim.parameters import check_space
 from deal_hw.sim.parameters.fields import ModelFields
@@ -239,6 +240,19 @@ def test_a_servo_reads_the_link_and_is_damped_at_the_motor(limit: float) -> None
     assert np.ptp(expected[1] - expected[0]) > 0.01
 
 
+def test_the_effort_limit_falls_with_the_speed_of_the_motor(tmp_path: Path) -> None:
+    """1 N·m at standstill, none at 8 rad/s: the wheel ends there, on the way of a body without a spring."""
+    laws = {"motor_free_speed": 8.0, "transmission_stiffness": 50.0, "transmission_damping": 0.05}
+    members = batch(robot(tmp_path, MOTOR), *(known(kind, "wheel", v) for kind, v in laws.items()))
+    _, velocity = members.advance(np.ones((1, 5000, 1)), every=100)
+    assert velocity[0, -1, 0] == pytest.approx(8.0, rel=1e-3)
+    # Rotor and wheel, a cylinder of 0.5 kg about its cross axis, and 1/8 N·m·s/rad of lost effort.
+    inertia = 0.01 + 0.5 * (3 * 0.1**2 + 0.04**2) / 12
+    late = np.arange(1, 6) * 0.2
+    expected = 8 * (1 - np.exp(-late / (inertia * 8)))
+    np.testing.assert_allclose(velocity[0, :5, 0], expected, rtol=0.01)
+
+
 @pytest.mark.parametrize("stiffness", [1e5, 1e8])
 def test_a_stiff_transmission_moves_as_the_rigid_model(tmp_path: Path, stiffness: float) -> None:
     """Two servos with friction and limits, to 0.3 mrad of 1 rad."""
@@ -342,7 +356,6 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             space(STIFF, ("servo_punch", "shoulder", 1.0)),
             r"servo_punch.*not simulated behind.*leave it",
         ),
-        (SERVO, space(STIFF, ("motor_free_speed", "shoulder", 5.0)), r"motor_free_speed.*leave it out"),
         (SERVO, space(STIFF, ("effort_gain", "shoulder", 1.0)), r"effort_gain.*transmission.*leave one out"),
         (
             SERVO,
@@ -366,9 +379,7 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             r"2 actuators \('shoulder', 'elbow'\).*one",
         ),
     ],
-    ids="no rotor,rotor of 0,play,punch,free speed,effort,no spring,RK4,own armature,joint limit,two".split(
-        ","
-    ),
+    ids="no rotor,rotor of 0,play,punch,effort,no spring,RK4,own armature,joint limit,two".split(","),
 )
 def test_what_cannot_be_is_refused(text: str, parameters: ParameterSpace, message: str) -> None:
     """With what is allowed, and what to do."""
@@ -376,7 +387,14 @@ def test_what_cannot_be_is_refused(text: str, parameters: ParameterSpace, messag
         check_space(mujoco.MjModel.from_xml_string(text), parameters)
 
 
-def test_a_gpu_is_refused(tmp_path: Path) -> None:
-    """Its kernels have no transmissions."""
-    with pytest.raises(ConfigurationError, match=r"not simulate the elastic.*'shoulder.*use --engine mujoco"):
-        ServoBatch(robot(tmp_path, SERVO), space(STIFF, rotor(0.01)), 1, threads=1, engine="warp-cpu")
+def test_a_gpu_has_no_transmissions(tmp_path: Path) -> None:
+    """A search on it is refused, and one that may choose takes MuJoCo and says why."""
+    model, parameters = robot(tmp_path, SERVO), space(STIFF, rotor(0.01))
+    reason = r"not simulate the elastic.*'shoulder.*use --engine mujoco"
+    with pytest.raises(ConfigurationError, match=reason):
+        ServoBatch(model, parameters, 1, threads=1, engine="warp-cpu")
+    with pytest.raises(ConfigurationError, match=reason):
+        choose_engine("warp", model, 256, "the search", print, space=parameters)
+    said: list[str] = []
+    assert choose_engine("auto", model, 256, "the search", said.append, space=parameters) == "mujoco"
+    assert "elastic transmission of 'shoulder.transmission_stiffness'" in said[0]

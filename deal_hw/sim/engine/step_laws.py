@@ -90,9 +90,15 @@ class StepLaws:
             for joint, value in values.get(kind, ()):
                 dof = int(model.jnt_dofadr[element_id(model, "joint", joint)])
                 found.setdefault(dof, {}).update(dict.fromkeys(coefficients, value))
-        free = {element_id(model, "actuator", name): value for name, value in values.get(FREE_SPEED, ())}
         firmware = ServoFirmware.of(fields, outputs, values)
         transmissions = Transmissions.of(fields, outputs, values)
+        # The limits of a motor behind a spring fall with its own speed, not with the joint's.
+        behind = () if transmissions is None else transmissions.names
+        free = {
+            element_id(model, "actuator", name): value
+            for name, value in values.get(FREE_SPEED, ())
+            if name not in behind
+        }
         if not found and not free and firmware is None and transmissions is None:
             return None
         count = len(outputs("qvel"))

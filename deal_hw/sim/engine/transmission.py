@@ -17,8 +17,10 @@ import numpy.typing as npt
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName
+from deal_hw.sim.laws.motor import effort_range
 from deal_hw.sim.laws.transmission import Coupling, TransmissionLaw
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
+from deal_hw.sim.parameters.laws import FREE_SPEED
 from deal_hw.sim.parameters.transmission import (
     TRANSMISSION_DAMPING,
     TRANSMISSION_PLAY,
@@ -68,6 +70,7 @@ class Transmissions:
         values: Values by kind; each actuator has a stiffness.
 
     Attributes:
+        names: Names of the actuators, B of them.
         angle: Angles of the motors, (N, B) [rad or m].
         speed: Their speeds, (N, B) [rad/s or m/s].
     """
@@ -78,7 +81,7 @@ class Transmissions:
             kind: dict(values.get(kind, ()))
             for kind in (TRANSMISSION_STIFFNESS, TRANSMISSION_DAMPING, TRANSMISSION_PLAY)
         }
-        names = list(given[TRANSMISSION_STIFFNESS])
+        names = self.names = list(given[TRANSMISSION_STIFFNESS])
         actuator = [element_id(model, "actuator", name) for name in names]
         joint = model.actuator_trnid[actuator, 0]
         dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
@@ -116,6 +119,12 @@ class Transmissions:
         self._control_range = np.where(
             model.actuator_ctrllimited[actuator], model.actuator_ctrlrange[actuator].T, [[-np.inf], [np.inf]]
         )
+        self._free_speed: FloatArray | None = None
+        if FREE_SPEED in values:
+            known = dict(values[FREE_SPEED])
+            never = np.full(shape[0], np.inf)
+            self._free_speed = np.stack([known.get(name, never) for name in names], axis=1)
+        self._bounded = bool(np.isfinite(self._control_range).any())
         self.angle, self.speed = np.zeros(shape), np.zeros(shape)
         self._fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
         self._coupling: Coupling | None = None
@@ -134,9 +143,12 @@ class Transmissions:
         """Take gains and limits in the fields as those of the motors, and put the transmissions there."""
         at = self._actuator
         self._own = self._gain[:, at, 0].copy(), self._bias[:, at, :3].copy(), self._range[:, at].copy()
-        self._ends = np.sort(self._gear[:, None] * self._own[2], axis=-1)
-        self._ends[:, ~self._limited] = -np.inf, np.inf
-        self._resistance = -self._own[1][..., 2] * self._gear**2
+        gain, bias, limits = self._own
+        ends = np.sort(self._gear[:, None] * limits, axis=-1)
+        ends[:, ~self._limited] = -np.inf, np.inf
+        self._least, self._most = ends[..., 0], ends[..., 1]
+        self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
+        self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
         self._put()
 
     def restore_sent(self) -> None:
@@ -190,25 +202,27 @@ class Transmissions:
     def write(self) -> None:
         """Write torques and inertias for the next step, whose controls are set."""
         link, link_speed = self._qpos[:, self._place], self._qvel[:, self._dof]
-        gain, bias, _ = self._own
-        control = np.clip(self._control[:, self._actuator], *self._control_range)
+        control, resistance = self._control[:, self._actuator], self._resistance
+        if self._bounded:
+            control = np.clip(control, *self._control_range)
         # A member that diverged has no numbers, and is found by the engine.
         with np.errstate(over="ignore", invalid="ignore"):
-            force = gain * control + bias[..., 0] + bias[..., 1] * self._gear * link
-            standing = self._gear * force
-            torque = standing - self._resistance * self.speed
-            held = np.clip(torque, self._ends[..., 0], self._ends[..., 1])
-            able = held == torque
-            coupling = self.law.couple(
-                self.angle - link,
-                self.speed,
-                link_speed,
-                np.where(able, standing, held),
-                np.where(able, self._resistance, 0.0),
-            )
+            torque = self._per_control * control + self._constant - self._per_position * link
+            if self._limited.any():
+                acting = torque - resistance * self.speed
+                held = np.clip(acting, *self._limits())
+                able = held == acting
+                torque, resistance = np.where(able, torque, held), np.where(able, resistance, 0.0)
+            coupling = self.law.couple(self.angle - link, self.speed, link_speed, torque, resistance)
         self._bias[:, self._actuator, 0] = coupling.torque / self._gear
         self._put_inertia(coupling.inertia)
         self._coupling = coupling
+
+    def _limits(self) -> tuple[FloatArray, FloatArray]:
+        """Return the least and largest torque of the motors at their speeds, (N, B) each."""
+        if self._free_speed is None:
+            return self._least, self._most
+        return effort_range(self.speed, self._most, self._free_speed)
 
     def follow(self) -> None:
         """Move the rotors by the step that the engine has done."""

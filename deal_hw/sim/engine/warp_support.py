@@ -10,8 +10,10 @@ import mujoco
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, MissingExtraError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName, WantedEngine, gpu_problem
 from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.transmission import check_engine
 
 Say: TypeAlias = Callable[[str], None]
 
@@ -99,7 +101,13 @@ def check_gpu() -> None:
 
 
 def choose_engine(
-    wanted: WantedEngine, robot: RobotModel, members: int, what: str, say: Say, without: str = ""
+    wanted: WantedEngine,
+    robot: RobotModel,
+    members: int,
+    what: str,
+    say: Say,
+    without: str = "",
+    space: ParameterSpace | None = None,
 ) -> EngineName:
     """Return what simulates many members, and say it.
 
@@ -110,9 +118,11 @@ def choose_engine(
         what: What is simulated, in words: "the search".
         say: Called with a sentence.
         without: Name of the method where it has no search that another engine can simulate; else "".
+        space: The parameters, if they are known.
 
     Raises:
-        ConfigurationError: The engine that was asked for cannot simulate this model, search or population.
+        ConfigurationError: The engine that was asked for cannot simulate this model, parameter, search or
+            population.
         MissingExtraError: MuJoCo Warp was asked for, and is not installed.
     """
     if wanted == "mujoco":
@@ -125,6 +135,8 @@ def choose_engine(
             )
         for name, model in {"": robot, **robot.setups}.items():
             check_model(model.model, f"the set-up {name}" if name else "the model")
+        if space is not None:
+            check_engine(space, "warp")
         check_installed()
         if wanted != "warp-cpu":
             check_gpu()

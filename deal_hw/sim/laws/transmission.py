@@ -84,6 +84,16 @@ class TransmissionLaw:
         """Torque a difference of the speeds at the end of the step, (N, B) [N·m·s/rad]."""
         return np.asarray(self.stiffness * self._ahead_s + self.damping)
 
+    @cached_property
+    def _carried(self) -> FloatArray:
+        """Torque that stops a rotor of 1 rad/s in one step, (N, B) [N·m·s/rad]."""
+        return self.inertia / self.step_s
+
+    @cached_property
+    def _gapless(self) -> bool:
+        """Whether no joint has play."""
+        return not np.any(self.play)
+
     def deflection(self, torque: FloatArray) -> FloatArray:
         """Return motor less link angles at which the transmissions at rest pass torques, (N, B)."""
         return np.asarray(torque / self.stiffness + np.sign(torque) * self.play / 2)
@@ -105,18 +115,21 @@ class TransmissionLaw:
             torque: Torque of the motor at standstill, t [N·m or N].
             resistance: What it loses with the motor's speed, c [N·m·s/rad or N·s/m].
         """
-        carried = self.inertia / self.step_s
-        drive = carried * motor_speed + torque
-        rotor = carried + resistance
-        # Whether the gap is closed is asked of a rotor that nothing holds yet.
-        reached = deflection + self._ahead_s * (drive / rotor - link_speed)
-        half = self.play / 2
-        closed = np.abs(reached) >= half
-        grip = np.where(closed, self._grip, 0.0)
-        push = np.where(closed, self.stiffness * (deflection - np.copysign(half, reached)), 0.0)
+        drive = self._carried * motor_speed + torque
+        rotor = self._carried + resistance
+        if self._gapless:
+            grip, push = self._grip, self.stiffness * deflection
+        else:
+            # Whether the gap is closed is asked of a rotor that nothing holds yet.
+            reached = deflection + self._ahead_s * (drive / rotor - link_speed)
+            half = self.play / 2
+            closed = np.abs(reached) >= half
+            grip = np.where(closed, self._grip, 0.0)
+            push = np.where(closed, self.stiffness * (deflection - np.copysign(half, reached)), 0.0)
         both = rotor + grip
         own_speed, follows = (drive - push) / both, grip / both
-        felt = grip * (1 - follows)
+        # The part of grip that the rotor's speed does not follow.
+        felt = follows * rotor
         return Coupling(
             torque=push + grip * own_speed - felt * link_speed,
             inertia=self.step_s * felt,

@@ -14,7 +14,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.kind import Kind, joint_of, one_dof_joint
-from deal_hw.sim.parameters.laws import FREE_SPEED, SERVO_LAW_KINDS, check_integrator
+from deal_hw.sim.parameters.laws import SERVO_LAW_KINDS, check_integrator
 
 TRANSMISSION_STIFFNESS: Final = "transmission_stiffness"
 TRANSMISSION_DAMPING: Final = "transmission_damping"
@@ -24,7 +24,7 @@ _OTHERS = {
     "servo_play": "leave it out: transmission_play is the play behind the motor",
     **{
         kind: "leave it out, or describe the actuator without transmission_stiffness"
-        for kind in (FREE_SPEED, *SERVO_LAW_KINDS)
+        for kind in SERVO_LAW_KINDS
     },
 }
 """Kinds of the same actuator that a transmission is not combined with, and what to do."""

@@ -362,7 +362,7 @@ def calibrate_episodes(
         from deal_hw.sim.engine.warp_support import choose_engine
 
         without = "" if takes_engine(method) else method
-        problem.engine = choose_engine(engine, robot, budget.population, "the search", say, without)
+        problem.engine = choose_engine(engine, robot, budget.population, "the search", say, without, space)
     check_delays(problem)
     check_efforts(problem)
     in_loop = policy is not None and search_of(method) in CLOSED_LOOP_METHODS
