@@ -53,6 +53,12 @@ def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> Flo
             "encoder_scale": 1.1,
             "motor_free_speed": 2.5,
         },
+        {
+            "transmission_stiffness": 60.0,
+            "servo_dead_zone": 0.02,
+            "servo_punch": 0.1,
+            "dof_friction_load": 0.1,
+        },
         {"servo_resolution": 0.01, "servo_speed_limit": 1.0, "encoder_bias": 0.05},
         {"servo_speed_limit": 1.0, "command_delay": 0.005, "encoder_scale": 1.1, "encoder_bias": 0.05},
     ],

@@ -76,6 +76,9 @@ class StepLaws:
         if self._limited:
             self._range = fields.get("actuator_forcerange")
             self._read_limits()
+        # Transmissions whose servos have a firmware.
+        behind = [] if transmissions is None or firmware is None else transmissions.actuator
+        self._served = [] if firmware is None else np.flatnonzero(np.isin(behind, firmware.actuator)).tolist()
         self._qvel = outputs("qvel")
         if self.loaded:
             # Outputs that are bound are copied after every step.
@@ -187,15 +190,13 @@ class StepLaws:
         Args:
             forward: Computes the torques of all simulations.
         """
-        fresh = self.transmissions if self.transmissions and self.transmissions.beginning else None
-        if not self.loaded and fresh is None:
-            return
-        if self.firmware is not None:
-            self.firmware.write()
-        if fresh is None:
+        rotors = self.transmissions
+        if rotors is not None and (self.loaded or rotors.fresh.any()):
+            rotors.begin(forward, self.firmware)
+        elif self.loaded:
+            if self.firmware is not None:
+                self.firmware.write()
             forward()
-        else:
-            fresh.begin(forward)
 
     def write(self) -> None:
         """Write friction, limits and the servos' efforts for the next step, whose controls are set."""
@@ -212,7 +213,7 @@ class StepLaws:
         if self.firmware is not None:
             self.firmware.write()
         if self.transmissions is not None:
-            self.transmissions.write()
+            self.transmissions.write(self._served)
 
     def follow(self) -> None:
         """Move what laws keep from step to step, after the engine's step."""

@@ -4,6 +4,7 @@ A joint's ``dof_armature`` is the rotor's inertia. It is taken out of the model,
 and a speed of its own. The actuator's gains, constant effort and limit give the motor's torque: from the
 position of the link, where the encoder is, and the speed of the motor. In the model the actuator is a
 constant torque, which is written before each step, and the armature is what the link feels of the rotor.
+So ``qfrc_actuator`` is what the transmission passes.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName
+from deal_hw.sim.engine.servo_firmware import ServoFirmware
 from deal_hw.sim.laws.motor import effort_range
 from deal_hw.sim.laws.transmission import Coupling, TransmissionLaw
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
@@ -71,6 +73,8 @@ class Transmissions:
 
     Attributes:
         names: Names of the actuators, B of them.
+        actuator: Their numbers.
+        fresh: Whether the rotors of a member follow from its state at the next beginning, (N,).
         angle: Angles of the motors, (N, B) [rad or m].
         speed: Their speeds, (N, B) [rad/s or m/s].
     """
@@ -82,7 +86,7 @@ class Transmissions:
             for kind in (TRANSMISSION_STIFFNESS, TRANSMISSION_DAMPING, TRANSMISSION_PLAY)
         }
         names = self.names = list(given[TRANSMISSION_STIFFNESS])
-        actuator = [element_id(model, "actuator", name) for name in names]
+        actuator = self.actuator = [element_id(model, "actuator", name) for name in names]
         joint = model.actuator_trnid[actuator, 0]
         dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
         self._actuator, self._dof, self._place = as_slice(actuator), as_slice(dof), as_slice(place)
@@ -104,7 +108,7 @@ class Transmissions:
             return np.stack([found.get(name, np.zeros(shape[0])) for name in names], axis=1)
 
         rotor = self._armature[:, self._dof].copy()
-        # Without the rotor, 1/J becomes 1/(J - rotor): that of the other joints' state where they are free.
+        # The inertia at the joint in the model's first pose, with all other joints free.
         whole = 1 / fields.get("dof_invweight0")[:, self._dof]
         self.law = TransmissionLaw(
             stiffness=of(TRANSMISSION_STIFFNESS),
@@ -126,7 +130,9 @@ class Transmissions:
             self._free_speed = np.stack([known.get(name, never) for name in names], axis=1)
         self._bounded = bool(np.isfinite(self._control_range).any())
         self.angle, self.speed = np.zeros(shape), np.zeros(shape)
-        self._fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
+        # What is in the fields of a transmission: the torque before the gear, and the inertia that is felt.
+        self._passed, self._felt = np.zeros(shape), rotor
+        self.fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
         self._coupling: Coupling | None = None
         self.read_sent()
 
@@ -137,7 +143,7 @@ class Transmissions:
 
     def restart(self, where: npt.NDArray[np.intp] | slice = slice(None)) -> None:
         """Let rotors of members follow from their states at the next beginning."""
-        self._fresh[where] = True
+        self.fresh[where] = True
 
     def read_sent(self) -> None:
         """Take gains and limits in the fields as those of the motors, and put the transmissions there."""
@@ -149,13 +155,11 @@ class Transmissions:
         self._least, self._most = ends[..., 0], ends[..., 1]
         self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
         self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
-        self._put()
+        self._write_motors(np.zeros(len(self.fresh), dtype=bool))
 
     def restore_sent(self) -> None:
         """Write the motors' gains and limits, and the rotors' inertias, where transmissions stand."""
-        at = self._actuator
-        self._gain[:, at, 0], self._bias[:, at, :3], self._range[:, at] = self._own
-        self._put_inertia(self.law.inertia)
+        self._write_motors(np.ones(len(self.fresh), dtype=bool))
 
     def restore(self) -> None:
         """Write the model's own values where transmissions stand; derived inertias are as they were."""
@@ -165,11 +169,15 @@ class Transmissions:
             field[:, at] = own
         self._armature[:, self._dof] = self._model.dof_armature[self._dof]
 
-    def _put(self) -> None:
-        at = self._actuator
-        self._gain[:, at, 0] = 0.0
-        self._bias[:, at, :3] = 0.0
-        self._range[:, at] = -np.inf, np.inf
+    def _write_motors(self, rows: npt.NDArray[np.bool_]) -> None:
+        """Write the motors as they are in the members of ``rows``, (N,), and transmissions in the others."""
+        at, there = self._actuator, rows[:, None]
+        gain, bias, limits = self._own
+        self._gain[:, at, 0] = np.where(there, gain, 0.0)
+        self._bias[:, at, :3] = np.where(there[..., None], bias, 0.0)
+        self._bias[:, at, 0] = np.where(there, bias[..., 0], self._passed)
+        self._range[:, at] = np.where(there[..., None], limits, (-np.inf, np.inf))
+        self._put_inertia(np.where(there, self.law.inertia, self._felt))
 
     def _put_inertia(self, inertia: FloatArray) -> None:
         """Write what the links have beside their own inertia, (N, B)."""
@@ -177,30 +185,39 @@ class Transmissions:
         if self._simple_dof:
             self._derived[:, self._simple_dof] = self._alone + inertia[:, self._simple]
 
-    @property
-    def beginning(self) -> bool:
-        """Whether any rotor's state follows from its joint's at the next beginning."""
-        return bool(self._fresh.any())
-
-    def begin(self, forward: Callable[[], None]) -> None:
+    def begin(self, forward: Callable[[], None], firmware: ServoFirmware | None) -> None:
         """Set the states of fresh rotors: they move with their links, and their springs pass what is needed.
 
         That is the motor's torque less what accelerates the rotor together with its link.
 
         Args:
             forward: Computes torques and accelerations of all simulations.
+            firmware: What servos make of their errors; None for servos without such a law.
         """
-        self.restore_sent()
+        rows = self.fresh
+        self._write_motors(rows)
+        if firmware is not None:
+            firmware.write()
+            # Members that go on pass the torque of their last step.
+            sent = self._bias[:, self._actuator, 0]
+            self._bias[:, self._actuator, 0] = np.where(rows[:, None], sent, self._passed)
         forward()
-        self._put()
-        rows, link = self._fresh, self._qvel[:, self._dof]
+        link = self._qvel[:, self._dof]
         passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
         self.speed[rows] = link[rows]
         self.angle[rows] = (self._qpos[:, self._place] + self.law.deflection(passed))[rows]
-        self._fresh[:] = False
+        rows[:] = False
+        self._write_motors(rows)
 
-    def write(self) -> None:
-        """Write torques and inertias for the next step, whose controls are set."""
+    def write(self, served: list[int]) -> None:
+        """Write torques and inertias for the next step, whose controls are set.
+
+        Args:
+            served: Places in B of servos whose firmware has just written their constant efforts.
+        """
+        if served:
+            efforts = self._bias[:, [self.actuator[k] for k in served], 0]
+            self._constant[:, served] = self._gear[served] * efforts
         link, link_speed = self._qpos[:, self._place], self._qvel[:, self._dof]
         control, resistance = self._control[:, self._actuator], self._resistance
         if self._bounded:
@@ -214,8 +231,9 @@ class Transmissions:
                 able = held == acting
                 torque, resistance = np.where(able, torque, held), np.where(able, resistance, 0.0)
             coupling = self.law.couple(self.angle - link, self.speed, link_speed, torque, resistance)
-        self._bias[:, self._actuator, 0] = coupling.torque / self._gear
-        self._put_inertia(coupling.inertia)
+        self._passed, self._felt = coupling.torque / self._gear, coupling.inertia
+        self._bias[:, self._actuator, 0] = self._passed
+        self._put_inertia(self._felt)
         self._coupling = coupling
 
     def _limits(self) -> tuple[FloatArray, FloatArray]:

@@ -14,20 +14,11 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.kind import Kind, joint_of, one_dof_joint
-from deal_hw.sim.parameters.laws import SERVO_LAW_KINDS, check_integrator
+from deal_hw.sim.parameters.laws import check_integrator
 
 TRANSMISSION_STIFFNESS: Final = "transmission_stiffness"
 TRANSMISSION_DAMPING: Final = "transmission_damping"
 TRANSMISSION_PLAY: Final = "transmission_play"
-
-_OTHERS = {
-    "servo_play": "leave it out: transmission_play is the play behind the motor",
-    **{
-        kind: "leave it out, or describe the actuator without transmission_stiffness"
-        for kind in SERVO_LAW_KINDS
-    },
-}
-"""Kinds of the same actuator that a transmission is not combined with, and what to do."""
 
 _EFFORTS = ("effort_gain", "effort_bias", "effort_delay", "effort_noise")
 
@@ -74,12 +65,11 @@ def check_transmissions(model: Any, space: ParameterSpace) -> None:
                     )
     for name in (e for kind, e in kinds if kind == TRANSMISSION_STIFFNESS):
         first = kinds[TRANSMISSION_STIFFNESS, name].name
-        for other, advice in _OTHERS.items():
-            if (other, name) in kinds:
-                raise ConfigurationError(
-                    f"parameter {kinds[other, name].name!r} ({other}) is not simulated behind {first!r}, an "
-                    f"elastic transmission of {name!r}; {advice}"
-                )
+        if ("servo_play", name) in kinds:
+            raise ConfigurationError(
+                f"parameter {kinds['servo_play', name].name!r} (servo_play) is a second play of {name!r} "
+                f"beside the elastic transmission {first!r}; leave it out: transmission_play is its play"
+            )
         joint = model.joint(joint_of(model, element_id(model, "actuator", name)))
         _check_rotor(model, joint, kinds.get(("dof_armature", joint.name)), first)
         for other in _EFFORTS:
