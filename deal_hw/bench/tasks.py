@@ -260,7 +260,7 @@ def _go2(ask: _Ask) -> Case:
 
     if ask.profile == "realistic":
         raise ConfigurationError("the Go2 target has the profiles ideal and sensor")
-    # `deal-hw train go2` makes policies for the driver's limits; the shipped one is of half the motors' effort.
+    # `deal-hw train go2` makes policies for the driver's limits; the shipped one has half the motors' effort.
     description = driver_description("go2") if ask.checkpoint else floor.DESCRIPTION
     robot = load_model(description)
     sensing = TargetSensing(
