@@ -191,9 +191,7 @@ class ClimbEnv(Go2Env):
         anywhere = rng.integers(task.levels, size=len(members))
         self.level[members] = np.where(moved >= task.levels, anywhere, np.maximum(moved, 0))
         self._climbed[members], self._way[members] = False, 0.0
-        kind = np.zeros(len(members), dtype=np.int64)
-        if len(task.terrains) > 1:
-            kind = rng.integers(len(task.terrains), size=len(members))
+        kind = rng.integers(len(task.terrains), size=len(members))
         low, high = np.array([task.ends_of(name) for name in task.terrains])[kind].T
         rise = low + (high - low) * self.level[members] / (task.levels - 1)
         rise[rng.random(len(members)) < task.flat] = 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
@@ -51,6 +51,12 @@ _LEG: Final = 2
 """Collision bit of legs on terrain; the floor does not have it."""
 _RANGE: Final = {"box": (0.0, 0.5, "m"), "steps": (0.0, 0.25, "m"), "slope": (0.0, 0.6, "rad")}
 _DISTANCE: Final = (0.5, 10.0)
+_EDGES: Final[Mapping[Kind, Sequence[float]]] = {
+    "box": (0.0,),
+    "steps": tuple(number * TREAD_M for number in range(STEPS)),
+    "slope": (),
+}
+"""Where terrain rises at once, from its beginning along x [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,23 +125,18 @@ class Terrain:
         return _height(self.kind, np.array(self.rise), np.asarray(x) - self.distance_m)
 
 
-def _edges(kind: Kind) -> FloatArray:
-    """Return where a terrain rises at once, from its beginning along x, (E,) [m]; a slope does nowhere."""
-    return np.array([number * TREAD_M for number in range({"box": 1, "steps": STEPS, "slope": 0}[kind])])
-
-
 def _top(kind: Kind, rise: FloatArray) -> FloatArray:
     """Return the heights of the last platform, (...,) [m]."""
     if kind == "slope":
         return np.asarray(RAMP_M * np.sin(rise))
-    return rise * len(_edges(kind))
+    return rise * len(_EDGES[kind])
 
 
 def _top_begins(kind: Kind, rise: FloatArray) -> FloatArray:
     """Return where the last platform begins, from the terrain's beginning along x, (...,) [m]."""
     if kind == "slope":
         return np.asarray(RAMP_M * np.cos(rise))
-    return np.full(np.shape(rise), _edges(kind)[-1])
+    return np.full(np.shape(rise), _EDGES[kind][-1])
 
 
 def _height(kind: Kind, rise: FloatArray, ahead: FloatArray) -> FloatArray:
@@ -143,7 +144,7 @@ def _height(kind: Kind, rise: FloatArray, ahead: FloatArray) -> FloatArray:
     if kind == "slope":
         ground = np.clip(ahead * np.tan(rise), 0.0, _top(kind, rise))
         return np.where(ahead <= _top_begins(kind, rise) + LENGTH_M, ground, 0.0)
-    risen = sum((np.asarray(ahead) >= edge).astype(int) for edge in _edges(kind))
+    risen = sum((np.asarray(ahead) >= edge).astype(int) for edge in _EDGES[kind])
     return np.where(ahead <= LENGTH_M, risen * rise, 0.0)
 
 
@@ -193,7 +194,7 @@ def _geoms(kind: Kind, rise: FloatArray, distance: FloatArray) -> _Geoms:
         middle = (distance + 0.5 * run + half * np.sin(rise), zero, 0.5 * top - half * np.cos(rise))
         add("ramp", (0.5 * RAMP_M, 0.5 * WIDTH_M, half), middle, -rise, 2)
         box("top", run, LENGTH_M, top)
-    for number, edge in enumerate(_edges(kind), 1):
+    for number, edge in enumerate(_EDGES[kind], 1):
         step, length = number * rise, LENGTH_M - edge
         box(f"face_{number}", zero + edge, length, step - EDGE_M)
         box(f"top_{number}", zero + edge + EDGE_M, length - EDGE_M, step)
@@ -333,7 +334,7 @@ class BatchTerrain:
     def _nearest(self, x: FloatArray, measure: Callable[[FloatArray], FloatArray]) -> FloatArray:
         distance, found = self._like(self.distance, x), []
         for kind in self.kinds:
-            ways = [measure(distance + edge - x) for edge in _edges(kind)]
+            ways = [measure(distance + edge - x) for edge in _EDGES[kind]]
             found.append(np.min([np.full(np.shape(x), np.inf), *ways], axis=0))
         return np.choose(self._like(self.kind, x), found)
 
