@@ -77,8 +77,9 @@ class StepLaws:
             self._range = fields.get("actuator_forcerange")
             self._read_limits()
         # Transmissions whose servos have a firmware.
-        behind = [] if transmissions is None or firmware is None else transmissions.actuator
-        self._served = [] if firmware is None else np.flatnonzero(np.isin(behind, firmware.actuator)).tolist()
+        self._served: list[int] = []
+        if transmissions is not None and firmware is not None:
+            self._served = np.flatnonzero(np.isin(transmissions.actuator, firmware.actuator)).tolist()
         self._qvel = outputs("qvel")
         if self.loaded:
             # Outputs that are bound are copied after every step.

@@ -26,9 +26,9 @@ _EFFORTS = ("effort_gain", "effort_bias", "effort_delay", "effort_noise")
 def _elastic(model: Any, actuator: int, name: str) -> None:
     drive_of(model, actuator, name)
     joint = joint_of(model, actuator)
-    one_dof_joint(model, joint, model.joint(joint).name)
-    check_integrator(model, "the torque of a transmission")
     own = model.joint(joint).name
+    one_dof_joint(model, joint, own)
+    check_integrator(model, "the torque of a transmission")
     if model.actuator_armature[actuator]:
         raise ConfigurationError(
             f"actuator {name!r} has an armature of its own; write it as that of the joint {own!r}, times the "
