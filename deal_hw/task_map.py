@@ -9,7 +9,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Generator, Sequence
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from typing_extensions import Self
 
@@ -17,6 +17,7 @@ from deal_hw.errors import TaskLostError
 
 S = TypeVar("S")
 R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class TaskMap(abc.ABC):
@@ -27,6 +28,25 @@ class TaskMap(abc.ABC):
 
     here = False
     """Whether tasks run in this process, so that they share its memory."""
+
+    _made: tuple[tuple[object, ...], Any] | None = None
+
+    @property
+    def workers(self) -> int:
+        """How many tasks run at once, now."""
+        return 1
+
+    def once(self, of: tuple[object, ...], make: Callable[[], F]) -> F:
+        """Return the function that was made for the same objects in the last call, or make it.
+
+        A function that is given again is not sent again, and keeps what it has stored in a worker. ``of`` is
+        all that it depends on, which nobody may change.
+        """
+        made = self._made
+        if made is None or [*map(id, made[0])] != [*map(id, of)]:
+            made = self._made = of, make()
+        function: F = made[1]
+        return function
 
     @abc.abstractmethod
     def completed(
@@ -39,7 +59,8 @@ class TaskMap(abc.ABC):
 
         Args:
             function: Pure: its result depends on the specification alone. What all tasks have in common, such
-                as recordings, is bound to it (``functools.partial``) and sent once.
+                as recordings, is bound to it (``functools.partial``) and sent once, also where the same
+                function is given in the next call.
             specs: One small value for each task.
             lost: Makes the result of a task that could not be done since its workers ended; None: that is
                 raised.

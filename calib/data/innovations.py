@@ -8,14 +8,16 @@ unit variance where the model is right, and removes what a wrong start state exp
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from deal_hw.calib.data.noise import NOISE_FREE_STD
-from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, measurements
-from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.calib.data.problem import Problem, WindowData, measurements
+from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
@@ -79,15 +81,65 @@ def predict(
     velocity: FloatArray | None = None,
     *,
     population: bool = False,
-) -> MemberPrediction:
+) -> FloatArray:
     """Predict windows like :meth:`Problem.predict`, also for slightly negative latencies.
 
-    A search's ``population`` is simulated by the problem's engine, which may be less exact.
+    A search's ``population`` is simulated by the problem's engine, which may be less exact. Returns the
+    measured channels, (N, W, H, M).
     """
     batch = problem.batch(len(members.theta), data.episode, population=population)
     batch.set_parameters(members.theta)
     path = early_setpoints(batch, problem.episodes[data.episode], members.latency_s)
-    return problem.predict_along(batch, path, data, position, velocity)
+    return problem.predict_along(batch, path, data, position, velocity).observed
+
+
+def predict_population(
+    problem: Problem,
+    members: Members,
+    data: WindowData,
+    position: FloatArray | None = None,
+    velocity: FloatArray | None = None,
+) -> FloatArray:
+    """Predict windows with a search's population; NaN where a member diverged.
+
+    The problem's engine simulates it, which may be less exact. Where the problem's tasks have more workers
+    than this process has threads, each worker simulates some of the members: the predictions are the same.
+
+    Args:
+        problem: Recordings, simulator and workers.
+        members: N members.
+        data: W windows of H samples.
+        position: Start positions of all members, (W, C); the smoothed ones by default.
+        velocity: Start velocities, (W, C).
+
+    Returns:
+        The measured channels, (N, W, H, M).
+    """
+    tasks, count = problem.tasks, len(members.theta)
+    parts = 1 if tasks.here or problem.engine != "mujoco" else min(tasks.workers, count)
+    if parts <= (problem.threads or default_threads()):
+        return predict(problem, members, data, position, velocity, population=True)
+    work = tasks.once(
+        (problem.robot, problem.space, *problem.episodes),
+        lambda: partial(_predict_some, problem.on_one_thread()),
+    )
+    # Only windows and their start states are sent.
+    nothing = np.empty((0, 0, 0))
+    sent = dataclasses.replace(
+        data, measured=nothing, std=nothing, prior_mean=nothing, prior_std=nothing, late=None
+    )
+    if position is not None and velocity is not None:
+        sent = dataclasses.replace(sent, start_position=position, start_velocity=velocity)
+    rows = np.array_split(np.arange(count), parts)
+    found = tasks.map(work, [(Members(members.theta[r], members.latency_s[r]), sent) for r in rows])
+    problem.count(sum(steps for _, steps in found))
+    return np.concatenate([observed for observed, _ in found])
+
+
+def _predict_some(problem: Problem, spec: tuple[Members, WindowData]) -> tuple[FloatArray, int]:
+    """Predict windows with some members, in a worker; return the measured channels and the physics steps."""
+    before = problem.steps
+    return predict(problem, *spec), problem.steps - before
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +215,7 @@ def linearise(
         state[1 + 2 * s, :, c] += 0.5 * std[:, s]
         state[2 + 2 * s, :, c] -= 0.5 * std[:, s]
     members = Members(np.repeat(centre.theta, count, axis=0), np.repeat(centre.latency_s, count))
-    predicted = predict(problem, members, data, position, velocity).observed
+    predicted = predict(problem, members, data, position, velocity)
     # Where the centre diverges, the window has no information on its start state: use the recording.
     reference = np.where(np.isfinite(predicted[0]), predicted[0], data.measured)
     predicted = np.where(np.isfinite(predicted), predicted, reference)
@@ -197,13 +249,14 @@ def whitened_residual(
 
     It is (N, M), not finite in rows of diverged members. ``offsets`` are the start states at the
     linearisation point, one array per entry of ``windows``, updated in place; None for the smoothed states.
-    ``whitenings`` were computed before for the same simulator and start states. ``population`` as in
-    :func:`predict`.
+    ``whitenings`` were computed before for the same simulator and start states. A search's ``population`` is
+    simulated by :func:`predict_population`.
     """
+    simulate = predict_population if population else predict
     parts = []
     for i, data in enumerate(windows):
         if problem.noise_free:
-            predicted = predict(problem, members, data, population=population).observed
+            predicted = simulate(problem, members, data)
             whitened = (data.measured - predicted) / data.std
             parts.append(whitened.reshape(len(whitened), -1))
             continue
@@ -212,7 +265,7 @@ def whitened_residual(
         else:
             whitening = linearise(problem, centre, data, None if offsets is None else offsets[i])
         starts = whitening.starts(data)
-        predicted = predict(problem, members, data, *starts, population=population).observed
+        predicted = simulate(problem, members, data, *starts)
         whitened = whitening.innovation(data.measured, predicted)
         parts.append(whitened.reshape(len(whitened), -1))
         if offsets is not None:

@@ -39,7 +39,7 @@ from deal_hw.calib.data.innovations import (
     cut,
     explained,
     linearise,
-    predict,
+    predict_population,
     samples_per_tick,
 )
 from deal_hw.calib.data.problem import Problem, WindowData
@@ -314,7 +314,7 @@ class _CleanView(_View):
             np.concatenate([members.theta, centre.theta]),
             np.concatenate([members.latency_s, centre.latency_s]),
         )
-        predicted = predict(self._problem, both, data, population=True).observed[:, :, self._at]
+        predicted = predict_population(self._problem, both, data)[:, :, self._at]
         real = data.measured[:, self._at] - predicted[-1]
         fake = predicted[:-1] - predicted[-1]
         return real.reshape(len(real), -1), fake.reshape(*fake.shape[:2], -1)
@@ -361,7 +361,7 @@ class _NoisyView(_View):
         offset = self._offsets[data.episode]
         whitening = linearise(self._problem, centre, data, offset)
         starts = whitening.starts(data)
-        predicted = predict(self._problem, members, data, *starts, population=True).observed
+        predicted = predict_population(self._problem, members, data, *starts)
         if self._move_starts:
             self._offsets[data.episode] = whitening.next_offset(data.measured)
         # The inverse Cholesky factor is lower triangular: each period's innovation is whitened by its past.

@@ -69,8 +69,29 @@ class _Common:
     folder: Path
 
 
-def _do(common: _Common, spec: Any) -> Any:
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """What all tasks of a call share, as a worker gets it: fetched from its machine's memory when needed.
+
+    Attributes:
+        common: Ray's reference.
+    """
+
+    common: Any
+
+
+_FETCHED: Final[dict[Any, _Common]] = {}
+"""In a worker: what it has fetched, by Ray's reference; the function of its last tasks."""
+
+
+def _do(sent: _Sent, spec: Any) -> Any:
     """Do a task in a worker."""
+    if sent.common not in _FETCHED:
+        import ray
+
+        _FETCHED.clear()
+        _FETCHED[sent.common] = ray.get(sent.common)
+    common = _FETCHED[sent.common]
     sys.argv[:] = common.argv
     if common.folder.is_dir():
         os.chdir(common.folder)
@@ -91,6 +112,7 @@ class RayTasks(TaskMap):
     def __init__(self, where: Where, threads: int = 1) -> None:
         needs_ray()
         self._where, self._threads = where, threads
+        self._sent: tuple[Callable[[Any], Any], _Sent] | None = None
 
     def __reduce__(self) -> tuple[type[InThisProcess], tuple[()]]:
         """A task that has tasks itself does them in its own process."""
@@ -140,6 +162,7 @@ class RayTasks(TaskMap):
         """Leave the cluster; workers that were started here end."""
         import ray
 
+        self._sent = None
         ray.shutdown()
 
     def completed(
@@ -158,20 +181,33 @@ class RayTasks(TaskMap):
         import ray
 
         task = ray.remote(max_retries=RETRIES, num_cpus=self._threads)(_do)
-        with explained(self._where):
-            common = ray.put(_Common(function, list(sys.argv), Path.cwd()))
+        sent = self._send(function)
         waiting, pending = deque(enumerate(specs)), dict[Any, int]()
         while waiting or pending:
             with explained(self._where):
-                while waiting and len(pending) <= self._room():
+                while waiting and len(pending) <= self.workers:
                     index, spec = waiting.popleft()
-                    pending[task.remote(common, spec)] = index
+                    pending[task.remote(sent, spec)] = index
             (done,), _ = ray.wait(list(pending), num_returns=1)
             index = pending.pop(done)
             yield index, self._result(done, specs[index], lost)
 
-    def _room(self) -> int:
-        """Return how many tasks run at once on the machines that are there now."""
+    def _send(self, function: Callable[[Any], Any]) -> _Sent:
+        """Send a function with what is bound to it, but for the one that was sent last.
+
+        Raises:
+            ClusterError: It cannot be sent.
+        """
+        import ray
+
+        if self._sent is None or self._sent[0] is not function:
+            with explained(self._where):
+                self._sent = function, _Sent(ray.put(_Common(function, list(sys.argv), Path.cwd())))
+        return self._sent[1]
+
+    @property
+    def workers(self) -> int:
+        """How many tasks run at once on the machines that are there now."""
         import ray
 
         return int(ray.cluster_resources().get("CPU", 0.0)) // self._threads

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.data.independent import in_order
+from deal_hw.calib.data.innovations import Members, predict_population
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts, run_identity
 from deal_hw.calib.fit.refinement import refine
@@ -21,14 +22,20 @@ from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
 from deal_hw.errors import TaskLostError
-from deal_hw.task_map import TaskMap
+from deal_hw.task_map import InThisProcess, TaskMap
 
 
 class Pickled(TaskMap):
     """Does tasks as workers do: with a copy of everything, and the last one first."""
 
-    def __init__(self) -> None:
-        self.done, self.closed = 0, 0
+    def __init__(self, workers: int = 1) -> None:
+        self.done, self.closed, self._workers = 0, 0, workers
+        self.last, self.functions = object(), 0
+
+    @property
+    def workers(self) -> int:
+        """See the base class."""
+        return self._workers
 
     def __reduce__(self) -> tuple[Callable[[], object], tuple[()]]:
         return object, ()
@@ -41,6 +48,8 @@ class Pickled(TaskMap):
     ) -> Generator[tuple[int, Any], None, None]:
         """See the base class."""
         sent = pickle.dumps(function)
+        if function is not self.last:
+            self.last, self.functions = function, self.functions + 1
         try:
             for index in reversed(range(len(specs))):
                 result = pickle.loads(sent)(pickle.loads(pickle.dumps(specs[index])))
@@ -108,6 +117,54 @@ def test_drawn_starts(both: tuple[Problem, Problem]) -> None:
         found.append((lower.theta.tobytes(), lower.chi2, lower.latency_s))
         steps.append(problem.steps)
     assert found[0] == found[1] and steps[0] == steps[1]
+
+
+@pytest.mark.parametrize(("workers", "tasks"), [(1, 0), (3, 3), (20, 7)])
+def test_a_population_is_shared_by_more_workers_than_threads(
+    both: tuple[Problem, Problem], workers: int, tasks: int
+) -> None:
+    """The same bits and steps; a worker that is no more than this process's thread brings nothing."""
+    here, there = both
+    there.tasks, here.threads, there.threads = Pickled(workers), 1, 1
+    data = here.windows(8)[0]
+    theta = here.space.nominal * np.linspace(0.5, 1.5, 7)[:, None]
+    members = Members(theta, np.linspace(-0.002, 0.02, 7))
+    moved = data.start_position + 0.01, data.start_velocity - 0.01
+    for starts in ((), moved):
+        found = [predict_population(problem, members, data, *starts) for problem in both]
+        assert found[0].tobytes() == found[1].tobytes() and np.isfinite(found[0]).all()
+    assert there.tasks.done == 2 * tasks
+    assert here.steps == there.steps > 0
+
+
+@pytest.mark.parametrize("noise", [None, 1e-3])
+@pytest.mark.parametrize("method", ["deal", "eki", "random"])
+def test_searches(both: tuple[Problem, Problem], method: str, noise: float | None) -> None:
+    """With a population in workers: all numbers are the same, and the recordings are sent once."""
+    results = []
+    for exact in both:
+        problem = exact
+        if noise is not None:
+            problem = dataclasses.replace(exact, known_std=np.full(4, noise))
+        problem.threads = 1
+        if exact is both[1]:
+            problem.tasks = Pickled(2)
+        budget = Budget(population=8, generations=4, refine=False)
+        found = make_method(method, refine=False).run(problem, budget, np.random.default_rng(0))
+        results.append((found.estimate.tobytes(), found.chi2, problem.steps))
+        if isinstance(problem.tasks, Pickled):
+            assert problem.tasks.done > 0
+            assert problem.tasks.functions == 1
+    assert results[0] == results[1]
+
+
+def test_a_function_is_made_anew_where_what_it_depends_on_is_another() -> None:
+    """By identity; equal values that are other objects count as others."""
+    tasks, first, second = InThisProcess(), [1], [1]
+    made = [tasks.once((first,), lambda: lambda: 1) for _ in range(2)]
+    assert made[0] is made[1]
+    assert tasks.once((second,), lambda: lambda: 2)() == 2
+    assert tasks.once((second, first), lambda: lambda: 3)() == 3
 
 
 @pytest.mark.slow

@@ -137,7 +137,7 @@ def test_negative_latency_is_a_shift_the_other_way(ideal: Case, problem: Problem
     """Predictions go smoothly through latency zero: -1, 0 and 1 ms are nearly on a line."""
     data = problem.windows(40)[0]
     theta = np.repeat(ideal.theta[None], 3, axis=0)
-    position = predict(problem, Members(theta, np.array([-1e-3, 0.0, 1e-3])), data).observed
+    position = predict(problem, Members(theta, np.array([-1e-3, 0.0, 1e-3])), data)
     plain = problem.predict(theta[:1], np.zeros(1), data).observed
     np.testing.assert_allclose(position[1], plain[0], atol=1e-12)
     slope = np.abs(position[2] - position[0])
@@ -192,7 +192,7 @@ def test_whitening_takes_out_a_wrong_start_state(ideal: Case, problem: Problem) 
     truth = Members(ideal.theta[None], np.zeros(1))
     whitening = linearise(problem, truth, data)
     velocity = data.start_velocity + np.array([0.0, problem.starts[0].typical_std[3]])
-    moved = predict(problem, truth, data, data.start_position, velocity).observed
+    moved = predict(problem, truth, data, data.start_position, velocity)
     size = np.linalg.norm(whitening.apply(moved - whitening.reference)[0], axis=1)
     raw = np.linalg.norm(((moved[0] - whitening.reference) / data.std).reshape(len(size), -1), axis=1)
     assert np.median(size) < 1.1

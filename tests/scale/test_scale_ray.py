@@ -62,6 +62,13 @@ def marks(spec):
     (folder / f"begun {spec}").touch()
     return spec
 
+class Counts:
+    calls = 0
+
+    def __call__(self, spec):
+        self.calls += 1
+        return [os.getpid(), self.calls]
+
 def raised(function, spec):
     try:
         tasks.map(function, [spec])
@@ -79,6 +86,9 @@ with task_map("local:2") as tasks:
     found["results"] = [tasks.map(task, range(20)), InThisProcess().map(task, range(20)), tasks.map(task, [])]
     found["worker"] = tasks.map(seen, [0])[0]
     found["raised"] = raised(fails, 3)
+    counts = Counts()
+    found["counts"] = [call for _ in range(2) for call in tasks.map(counts, range(10))]
+    found["workers"] = tasks.workers
     here = psutil.Process()
     found["listening"] = [ip for p in (here, *here.children(recursive=True)) for ip in listening(p)]
     found["died once"] = tasks.map(dies_once, [1, 2])
@@ -134,6 +144,14 @@ def test_a_worker_knows_command_line_and_folder_and_has_one_thread(
 ) -> None:
     """Relative paths mean the same there; numeric libraries do not take each other's processors."""
     assert found[1]["worker"] == [["bench", "x"], str(found[0]), "1", "1"]
+
+
+def test_a_function_that_is_given_again_is_not_sent_again(found: tuple[Path, dict[str, Any]]) -> None:
+    """Each worker keeps its own, which counts all tasks that the worker did, in both calls."""
+    last = dict[int, int]()
+    for worker, calls in found[1]["counts"]:
+        last[worker] = max(calls, last.get(worker, 0))
+    assert found[1]["workers"] == 2 >= len(last) and sum(last.values()) == 20
 
 
 def test_an_error_of_a_task_is_raised_here(found: tuple[Path, dict[str, Any]]) -> None:
