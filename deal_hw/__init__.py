@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from deal_hw.workflows.stop import stop as stop
     from deal_hw.workflows.train import Training as Training
     from deal_hw.workflows.train import train as train
+    from deal_hw.workflows.train_seeds import SeedTrainings as SeedTrainings
+    from deal_hw.workflows.train_seeds import train_seeds as train_seeds
 
 _EXPORTS = {
     "workflows.calibrate": ("calibrate", "Calibration"),
@@ -79,6 +81,7 @@ _EXPORTS = {
     ),
     "workflows.stop": ("stop", "StopReport"),
     "workflows.train": ("train", "Training"),
+    "workflows.train_seeds": ("train_seeds", "SeedTrainings"),
     "transport": ("WireOptions",),
 }
 """Module -> names, imported on use."""

@@ -53,7 +53,7 @@ API_NAMES = {
     "Stop a robot": ("stop", "StopReport"),
     "Emulate a robot": ("emulate", "EmulatedRobot"),
     "Describe a robot": ("new_robot", "check_robot", "RobotCheck", "lock_joints", "LockedJoints"),
-    "Train and inspect": ("train", "Training", "inspect", "Inspection"),
+    "Train and inspect": ("train", "Training", "train_seeds", "SeedTrainings", "inspect", "Inspection"),
     "Policies of others": ("import_policy", "check_policy", "PolicyReport"),
 }
 """Pages of the API with names of ``deal_hw`` itself."""

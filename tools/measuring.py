@@ -43,7 +43,7 @@ def parser(doc: str | None, *, out: bool = True, table: bool = False) -> argpars
 
 def add_seeds(made: argparse.ArgumentParser, *default: int) -> None:
     """Add `--seeds`, numbers and ranges such as 1,2,3 or 1000-1009."""
-    from deal_hw.bench.settings import parse_seeds
+    from deal_hw.workflows.options import parse_seeds
 
     made.add_argument("--seeds", type=parse_seeds, default=default, help="such as 1,2,3 or 1000-1009")
 

@@ -20,33 +20,7 @@ from deal_hw.scale.where import task_map
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.task_map import TaskMap
 from deal_hw.workflows.calibration.settings import Recordings
-from deal_hw.workflows.options import OneWord, Ratio, RayPlace, Threads
-
-MOST_SEEDS: Final = 10_000
-"""Most seeds of one range."""
-
-SEEDS: Final = Range(0, 2**32 - 1 - MOST_SEEDS)
-
-
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds of a text such as ``"0,3,1000-1009"``.
-
-    Raises:
-        ConfigurationError: It is not such a text.
-    """
-    seeds: list[int] = []
-    for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        try:
-            ends = int(first), int(last if dash else first)
-        except ValueError as err:
-            raise ConfigurationError(
-                f"--seeds {text!r}: give numbers and ranges, such as 0,1 or 1000-1009"
-            ) from err
-        SEEDS.check("--seeds", ends)
-        Range(ends[0], ends[0] + MOST_SEEDS).check("--seeds", ends[1])
-        seeds += range(ends[0], ends[1] + 1)
-    return tuple(seeds)
+from deal_hw.workflows.options import OneWord, Ratio, RayPlace, Seeds, Threads
 
 
 def parse_ratios(text: str) -> tuple[float, ...]:
@@ -77,7 +51,6 @@ def parse_names(text: str, option: str) -> tuple[str, ...]:
     return names
 
 
-Seeds = Annotated[tuple[int, ...], SEEDS, OneWord(parse_seeds, "SEEDS")]
 Ratios = Annotated[tuple[float, ...], Ratio, OneWord(parse_ratios, "RATIOS")]
 Names = tuple[str, ...]
 Tasks = Annotated[Names, OneWord(partial(parse_names, option="--task"), "TASKS")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from deal_hw.cli.piped import PipedProgress, Quiet, is_quiet
 from deal_hw.documentation import page
+from deal_hw.errors import ConfigurationError, TrainingError
 from deal_hw.robots import driven_robots
 from deal_hw.training import TrainingProgress, TrainingStatus
+from deal_hw.workflows.options import RayPlace, Seeds
 from deal_hw.workflows.say import silent, to_stderr
 from deal_hw.workflows.train import TRAIN, InterruptedTrainingError, Training, TrainSettings, run
+from deal_hw.workflows.train_seeds import SeedTrainings, run_seeds
 
 SHOWN_MEASURES = 3
 """Number of a task's measures beside the progress; TensorBoard's files have all."""
@@ -26,15 +30,24 @@ class ShownTraining(Quiet):
     distribution: Path | None = None
     """distribution.json of a calibration: parameters, their uncertainty, latency."""
 
+    seeds: Seeds = ()
+    """Train a policy with each of these seeds instead of --seed: numbers and ranges, as 0-4. Each writes into
+    a folder of its own, such as seed_0, in --out."""
+
+    ray: RayPlace = None
+    """Where the trainings of --seeds run: local, local:N, HOST:PORT or auto (docs/how-to/cluster.md); by
+    default here, one after the other."""
+
 
 KINDS = TRAIN.with_options(ShownTraining)
 
 
-def train(config: TrainSettings) -> Training:
-    """Run the verb; see :func:`deal_hw.workflows.train.train`."""
+def train(config: TrainSettings, quiet: bool | None = None) -> Training:
+    """Run the verb, or as quietly as asked; see :func:`deal_hw.workflows.train.train`."""
+    quiet = is_quiet(config) if quiet is None else quiet
     try:
-        if is_quiet(config) or sys.stdout.isatty():
-            training = _with_bar(config)
+        if quiet or sys.stdout.isatty():
+            training = _with_bar(config, quiet)
         else:
             with PipedProgress("train") as piped:
                 training = run(config, lambda status: piped.at(_words(status)), to_stderr)
@@ -46,12 +59,63 @@ def train(config: TrainSettings) -> Training:
     return training
 
 
-def train_and_say_next(config: TrainSettings) -> Training:
-    """Train, and print the line that runs the policy."""
-    training = train(config)
-    if not is_quiet(config) and config.robot in driven_robots():
+def train_and_say_next(config: TrainSettings) -> Training | SeedTrainings:
+    """Train, and print the line that runs the policy.
+
+    Raises:
+        TrainingError: A training of several ended by a fault; the others were done.
+    """
+    done: Training | SeedTrainings
+    if isinstance(config, ShownTraining) and (config.seeds or config.ray is not None):
+        done = _train_seeds(config, config.seeds, config.ray)
+    else:
+        done = train(config)
+    training = done.best if isinstance(done, SeedTrainings) else done
+    if training is not None and not is_quiet(config) and config.robot in driven_robots():
         print(f"next: deal-hw deploy {config.robot} --port PORT --policy {training.path}")
-    return training
+    if isinstance(done, SeedTrainings) and done.failed:
+        raise TrainingError(
+            f"seeds {', '.join(map(str, done.failed))} failed; the others are in {config.out}"
+        )
+    return done
+
+
+def _train_seeds(config: TrainSettings, seeds: Sequence[int], ray: str | None) -> SeedTrainings:
+    """Train with each seed, and print what each reached."""
+    if not seeds:
+        raise ConfigurationError(f"--ray {ray} shares the trainings of several seeds: give --seeds, as 0-4")
+    if config.seed:
+        raise ConfigurationError("--seed and --seeds exclude each other: keep one of them")
+
+    def one(own: TrainSettings) -> Training:
+        print(f"seed {own.seed}:")
+        return train(own, is_quiet(config))
+
+    if ray is None:
+        done = run_seeds(config, seeds, train=one)
+    else:
+        with PipedProgress("train", is_quiet(config)) as piped:
+            ended = 0
+
+            def follow(seed: int, result: Training | str) -> None:
+                nonlocal ended
+                ended += 1
+                piped.say(f"seed {seed}: {_outcome(result)} ({ended}/{len(seeds)})")
+
+            piped.at(f"{len(seeds)} trainings in workers")
+            try:
+                done = run_seeds(config, seeds, ray=ray, ended=follow)
+            except KeyboardInterrupt:
+                print("stopped before the end; --resume continues each seed from its last checkpoint")
+                raise
+    print(done.table())
+    return done
+
+
+def _outcome(result: Training | str) -> str:
+    if isinstance(result, str):
+        return result
+    return "done" if result.status is None else _words(result.status)
 
 
 def _print(training: Training) -> None:
@@ -68,7 +132,7 @@ def _print(training: Training) -> None:
         )
 
 
-def _with_bar(config: TrainSettings) -> Training:
+def _with_bar(config: TrainSettings, quiet: bool) -> Training:
     bar = Progress(
         TextColumn("training"),
         BarColumn(),
@@ -77,10 +141,10 @@ def _with_bar(config: TrainSettings) -> Training:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        disable=is_quiet(config),
+        disable=quiet,
     )
     try:
-        return run(config, _follow(bar), silent if is_quiet(config) else to_stderr)
+        return run(config, _follow(bar), silent if quiet else to_stderr)
     finally:
         if bar.live.is_started:
             bar.stop()

@@ -8,7 +8,7 @@ import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar, overload
+from typing import Annotated, Any, Final, ParamSpec, TypeVar, overload
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Range, option
@@ -37,7 +37,35 @@ S = TypeVar("S")
 
 File = Path | str
 """A file or folder, by its path."""
+MOST_SEEDS: Final = 10_000
+"""Most seeds of one range."""
+
+SEEDS: Final = Range(0, 2**32 - 1 - MOST_SEEDS)
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of a text such as ``"0,3,1000-1009"``.
+
+    Raises:
+        ConfigurationError: It is not such a text.
+    """
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        try:
+            ends = int(first), int(last if dash else first)
+        except ValueError as err:
+            raise ConfigurationError(
+                f"--seeds {text!r}: give numbers and ranges, such as 0,1 or 1000-1009"
+            ) from err
+        SEEDS.check("--seeds", ends)
+        Range(ends[0], ends[0] + MOST_SEEDS).check("--seeds", ends[1])
+        seeds += range(ends[0], ends[1] + 1)
+    return tuple(seeds)
+
+
 Seed = Annotated[int, Range(0, 2**32 - 1)]
+Seeds = Annotated[tuple[int, ...], SEEDS, OneWord(parse_seeds, "SEEDS")]
 Threads = Annotated[int | None, Range(1, 1024)]
 RunSeconds = Annotated[float, Range(0.02, 3600, "s")]
 RayPlace = str | None

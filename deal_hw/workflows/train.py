@@ -47,6 +47,11 @@ class Calibrated(Protocol):
         ...
 
 
+def policy_path(out: File) -> Path:
+    """Return the policy's file of an ``--out``."""
+    return Path(out) if Path(out).suffix == ".onnx" else Path(out) / POLICY_FILE
+
+
 def unseen(status: TrainingStatus) -> None:
     """Show no progress."""
 
@@ -237,9 +242,8 @@ def train(settings: TrainSettings) -> Training:
 
 def run(config: TrainSettings, progress: TrainingProgress, say: Say = silent) -> Training:
     """Train a policy, as :func:`train`, show the progress, and say what simulates."""
-    out = Path(config.out)
-    path = out if out.suffix == ".onnx" else out / POLICY_FILE
-    distribution, verdict = _distribution(config)
+    path = policy_path(config.out)
+    distribution, verdict = distribution_of(config)
     checkpoint = path.with_suffix(".safetensors")
     if config.resume and config.start is not None:
         raise ConfigurationError("--start and --resume exclude each other: leave one of them out")
@@ -409,8 +413,12 @@ def _spent(record: Path) -> dict[str, float]:
     return {name: float(values[name]) for name in ("seconds", "cpu_seconds")}
 
 
-def _distribution(config: TrainSettings) -> tuple[ParameterDistribution, str]:
-    """Return the distribution, and the colour of its calibration; "" if it is of none."""
+def distribution_of(config: TrainSettings) -> tuple[ParameterDistribution, str]:
+    """Return the distribution of a training, and the colour of its calibration; "" if it is of none.
+
+    Raises:
+        ConfigurationError: Not exactly one was named, or it cannot be read.
+    """
     udr, own = isinstance(config, TrainRobotSettings) and config.udr, isinstance(config, TrainOwnSettings)
     wanted = {
         "--distribution": config.distribution is not None,

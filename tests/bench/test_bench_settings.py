@@ -17,11 +17,11 @@ from deal_hw.bench.settings import (
     Verdict,
     parse_names,
     parse_ratios,
-    parse_seeds,
 )
 from deal_hw.calib.pipeline.methods import check_method
 from deal_hw.cli.main import parse
 from deal_hw.errors import ConfigurationError
+from deal_hw.workflows.options import parse_seeds
 
 MEASURED = Path(__file__).parents[2] / "docs" / "measured"
 
