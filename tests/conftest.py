@@ -1,5 +1,6 @@
 """What holds for all tests."""
 
+import fcntl
 import functools
 import gc
 import json
@@ -9,6 +10,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +116,15 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def loaded_by_collection(pytestconfig: pytest.Config) -> frozenset[str]:
     """The modules that collecting the tests loaded, by their full names."""
     return pytestconfig.stash[LOADED]
+
+
+@pytest.fixture(scope="module")
+def one_ray(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Wait until no other worker of pytest has tests with Ray: its processes start within 15 s or end."""
+    # The folder above is that of all workers of a run.
+    with (tmp_path_factory.getbasetemp().parent / "ray.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 computing = False

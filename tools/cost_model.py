@@ -1,10 +1,11 @@
-"""What a search of the DEAL paper costs on other machines: a model of the measured rows, checked on others.
+"""What a search costs on other machines: a model of the measured rows, checked on others.
 
 A generation costs the physics of all members, which cores or a GPU share, and the rest: critic, policy and
 arithmetic of one process, which they do not. The rest is linear in the members; its two numbers are fitted to
 the cart-pole's rows of `bench speed` with fewer than 400 members, and scaled to each task's own row. Rows
 that took no part in that are predicted, and the error is printed. Physics on a GPU is that of
-docs/how-to/gpu.md.
+docs/how-to/gpu.md. The DEAL paper's search has one world for each member; `deal` and `eki` one for each
+member and window.
 
 .venv/bin/python tools/cost_model.py
 .venv/bin/python tools/cost_model.py --members 200,4096 --cores 2,16,64
@@ -36,6 +37,9 @@ H200: Final = {
 
 H200_WORLDS: Final = (1024, 4096, 16384)
 
+WINDOWS: Final = 20
+"""Windows in the bench's 2 s of recording: worlds on a GPU for each member of `deal` and `eki`."""
+
 RAY_SHARE: Final = 0.03
 """Share of a core that Ray's own processes take while workers run (docs/how-to/cluster.md)."""
 
@@ -65,11 +69,12 @@ class Cost:
         busy = min(cores, members)
         return members * self.steps * self.step_s / busy + self.rest(members)
 
-    def on_gpu(self, members: int, rates: Sequence[float]) -> float:
+    def on_gpu(self, members: int, rates: Sequence[float], windows: int = 1) -> float:
         """Return a generation's seconds on a GPU; fewer worlds than measured take as long as those."""
         measured = [n / rate for n, rate in zip(H200_WORLDS, rates, strict=True)]
-        step_s = float(np.interp(members, H200_WORLDS, measured)) * max(members / H200_WORLDS[-1], 1.0)
-        return self.steps * step_s + self.rest(members)
+        worlds = members * windows
+        step_s = float(np.interp(worlds, H200_WORLDS, measured)) * max(worlds / H200_WORLDS[-1], 1.0)
+        return self.steps / windows * step_s + self.rest(members)
 
 
 def rest_of(row: dict[str, Any]) -> float:
@@ -119,36 +124,57 @@ def main() -> None:
     options.add_argument("--cores", default="2,16,64", help="cores of one machine")
     options.add_argument("--generations", type=int, default=50)
     args = options.parse_args()
+    cores, members = ([int(word) for word in text.split(",")] for text in (args.cores, args.members))
     speed, varied = load_rows(MEASURED / "speed.json"), load_rows(MEASURED / "speed_cost.json")
-    fitted = [row for row in varied if row["task"] == "cartpole" and row["population"] < 400]
-    known = costs(speed, fitted)
-    print("Rows that took no part in the fit:")
-    others = [row for row in varied if row not in fitted]
-    check = [
-        (row["task"], row["parameters"], row["population"], row["generations"], f"{row['seconds']:.1f}",
-         f"{predicted(known[row['task']], row):.1f}")
-        for row in others
-    ]  # fmt: skip
-    print(text_table(("task", "parameters", "members", "generations", "measured [s]", "model [s]"), check))
-    cores = [int(word) for word in args.cores.split(",")]
-    for members in map(int, args.members.split(",")):
-        print(
-            f"\n{args.generations} generations of {members} members [s]; in brackets the share of the rest:"
-        )
-        rows = []
-        for task, cost in known.items():
-            taken = [cost.on_cores(members, n) for n in cores] + [cost.on_gpu(members, H200[task])]
-            cells = [f"{args.generations * t:.0f} ({cost.rest(members) / t:.0%})" for t in taken]
-            balance = members * cost.steps * cost.step_s / cost.rest(members)
-            rows.append((task, *cells, f"{balance:.0f}"))
-        head = ("task", *(f"{n} cores" for n in cores), "H200", "cores at which the rest is half")
-        print(text_table(head, rows))
+    known = checked("deal-paper", speed, varied)
+    for count in members:
+        show(known, count, args.generations, cores)
     print("\nSearches an hour of 200 members on 1,000 cores, by Ray with two cores each:")
     many = [
         (task, f"{500 * (1 - RAY_SHARE) * 3600 / (args.generations * cost.on_cores(200, 2)):,.0f}")
         for task, cost in known.items()
     ]
     print(text_table(("task", "searches an hour"), many))
+    windows = load_rows(MEASURED / "speed_windows.json")
+    for method in ("deal", "eki"):
+        rows = [row for row in windows if row["method"] == method]
+        usual = [row for row in rows if row["population"] == 100]
+        known = checked(method, usual, [row for row in rows if row not in usual or row["task"] == "cartpole"])
+        for count in (100, 1000):
+            show(known, count, args.generations, cores, WINDOWS)
+
+
+def checked(
+    method: str, speed: Sequence[dict[str, Any]], varied: Sequence[dict[str, Any]]
+) -> dict[str, Cost]:
+    """Fit a method's rows, and print how rows that took no part in the fit are predicted."""
+    fitted = [row for row in varied if row["task"] == "cartpole" and row["population"] < 400]
+    known = costs(speed, fitted)
+    print(f"\n{method}: rows that took no part in the fit:")
+    check = [
+        (row["task"], row["parameters"], row["population"], row["generations"], f"{row['seconds']:.1f}",
+         f"{predicted(known[row['task']], row):.1f}")
+        for row in varied
+        if row not in fitted
+    ]  # fmt: skip
+    print(text_table(("task", "parameters", "members", "generations", "measured [s]", "model [s]"), check))
+    return known
+
+
+def show(
+    known: dict[str, Cost], members: int, generations: int, cores: Sequence[int], windows: int = 1
+) -> None:
+    """Print what generations take on machines with so many cores, and on an H200."""
+    print(f"\n{generations} generations of {members} members [s]; in brackets the share of the rest:")
+    rows = []
+    for task, cost in known.items():
+        taken = [cost.on_cores(members, n) for n in cores] + [cost.on_gpu(members, H200[task], windows)]
+        cells = [f"{generations * t:.0f} ({cost.rest(members) / t:.0%})" for t in taken]
+        balance = members * cost.steps * cost.step_s / cost.rest(members)
+        rows.append((task, *cells, f"{balance:.0f}"))
+    print(
+        text_table(("task", *(f"{n} cores" for n in cores), "H200", "cores at which the rest is half"), rows)
+    )
 
 
 if __name__ == "__main__":

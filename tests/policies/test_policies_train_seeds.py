@@ -93,6 +93,7 @@ def test_no_distribution_is_said_before_workers_are_started(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_ray")
 @pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed (extra scale)")
 def test_workers_make_the_same_policies(tmp_path: Path) -> None:
     """With one thread of the numeric libraries here, as workers have."""

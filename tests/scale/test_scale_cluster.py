@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from deal_hw.scale.ray_start import STARTS
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.usefixtures("one_ray"),
+    pytest.mark.filterwarnings("default:Ray failed"),
     pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed (extra scale)"),
 ]
 
@@ -198,6 +201,7 @@ def in_namespace(
         )
         if "timed out during startup" not in done.stderr:
             break
+        warnings.warn("Ray failed: it did not start in time", stacklevel=2)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()[-1]
 

@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ import pytest
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.usefixtures("one_ray"),
+    pytest.mark.filterwarnings("default:Ray failed"),
     pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed (extra scale)"),
 ]
 
@@ -103,8 +106,8 @@ print(json.dumps(found))
 """
 
 
-def run(folder: Path) -> dict[str, Any] | None:
-    """Run the program; None where Ray itself hung or ended it by a signal."""
+def run(folder: Path) -> dict[str, Any] | str:
+    """Run the program, and return what it found; or how Ray itself ended it."""
     line = [sys.executable, "-c", PROGRAM, "bench", "x"]
     with subprocess.Popen(
         line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -114,9 +117,9 @@ def run(folder: Path) -> dict[str, Any] | None:
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
-            return None
+            return f"hung for {LONGEST_S} s"
     if process.returncode < 0:
-        return None
+        return f"ended its process by {signal.Signals(-process.returncode).name}"
     assert process.returncode == 0, errors
     found: dict[str, Any] = json.loads(printed.splitlines()[-1])
     return found
@@ -127,9 +130,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     """The folder of the program, and what it found; where Ray itself failed, it is run once more."""
     for _ in range(2):
         folder = tmp_path_factory.mktemp("ray")
-        if (result := run(folder)) is not None:
+        result = run(folder)
+        if not isinstance(result, str):
             return folder, result
-    pytest.fail(f"Ray hung for {LONGEST_S} s or ended its process, twice")
+        warnings.warn(f"Ray failed: it {result}", stacklevel=1)
+    pytest.fail(f"Ray {result}, for the second time")
 
 
 def test_results_are_those_of_this_process(found: tuple[Path, dict[str, Any]]) -> None:
