@@ -21,6 +21,7 @@ multicast, which a network of its own allows:
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import os
@@ -28,6 +29,7 @@ import pty
 import re
 import select
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -54,6 +56,9 @@ from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
 from deal_hw.drivers.so101.emulator import homed, limits_of
 from deal_hw.errors import TransportError
 from deal_hw.robots import recorded_description
+from deal_hw.sim.robots.robot_file import write_robot_file
+from deal_hw.sim.robots.ros2_section import Ros2Section
+from deal_hw.sim.robots.user_robot import derive_robot
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.own_robot.new import new_robot
 
@@ -175,6 +180,21 @@ def write_files(client: Client, folder: Path) -> None:
         }
         (folder / "so101.json").write_text(json.dumps(motors))
 
+    if "ros2" in client.files:
+        _write_ros2_robot(folder)
+
+
+def _write_ros2_robot(folder: Path) -> None:
+    """Write a robot.yaml of ros2_control with the SO-101's joints, beside its MJCF."""
+    source = Path(str(recorded_description("so101").mjcf))
+    shutil.copytree(source.parent, folder, dirs_exist_ok=True)
+    own = derive_robot(folder / source.name, name="an arm", control_rate_hz=50.0).file
+    joints = tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints)
+    names = tuple(joint.name for joint in joints)
+    section = Ros2Section(bus="ros2_control", controller="arm_controller", command="position", joints=names)
+    file = dataclasses.replace(own, state_rate_hz=100.0, joints=joints, hardware=section)
+    (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
+
 
 def prepare(client: Client, port: str) -> None:
     """Do what a user does before the program: set the device up."""
@@ -226,7 +246,13 @@ def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
         emulator = stack.enter_context(EmulatorProcess(*words))
         port = emulator.port.partition("?")[0].removeprefix("slcan:")
         prepare(client, port)
-        places = {"source": folder / client.source, "port": port, "tools": TOOLS, "folder": work}
+        places = {
+            "source": folder / client.source,
+            "port": port,
+            "tools": TOOLS,
+            "folder": work,
+            "python": sys.executable,
+        }
         command = [str(python), "-u", *(part.format(**places) for part in client.command)]
         paths = [TOOLS, *(folder / path for path in client.paths)]
         environment = os.environ | {

@@ -22,9 +22,9 @@ class Client:
 
     Attributes:
         name: Its name in the table.
-        source: File or folder below the user's folder that must be there.
-        command: Arguments after Python; ``{source}``, ``{port}``, ``{tools}`` and ``{folder}``, its working
-            folder, are replaced.
+        source: File or folder below the user's folder that must be there; "" for a package of its own.
+        command: Arguments after Python; ``{source}``, ``{port}``, ``{tools}``, ``{folder}``, its working
+            folder, and ``{python}``, that of deal-hw, are replaced.
         emulator: Arguments of ``deal-hw emulate``; ``{folder}`` is replaced.
         opens: The port or bus that the program opens by name; "" if it takes it as an argument.
         paths: Folders below the user's folder for PYTHONPATH.
@@ -34,7 +34,8 @@ class Client:
         prepare: What the user does before: "velocity" sets an ODrive to velocity control, "factory" resets
             servos, except id and rate.
         files: Files in its working folder: "endpoints" and "config" of the emulated ODrive; "so101", an
-            SO-101's robot.yaml and LeRobot's calibration of it; "homed", that of the emulated SO-101.
+            SO-101's robot.yaml and LeRobot's calibration of it; "homed", that of the emulated SO-101; "ros2",
+            a robot.yaml of ros2_control with the SO-101's joints.
         servo_rate: Baud rate of the servos.
         keys: Pairs: what is printed, and the keys to press then; each once, in this order.
         hesitation_s: Time before a key is pressed [s]: a program sets the terminal up after its prompt, and
@@ -56,7 +57,7 @@ class Client:
     unused: tuple[str, ...] = ()
     own_python: bool = False
     prepare: Literal["", "velocity", "factory"] = ""
-    files: tuple[Literal["endpoints", "config", "so101", "homed"], ...] = ()
+    files: tuple[Literal["endpoints", "config", "so101", "homed", "ros2"], ...] = ()
     servo_rate: int = 57_600
     keys: tuple[tuple[str, str], ...] = ()
     hesitation_s: float = 0.5
@@ -197,6 +198,15 @@ CLIENTS: Final = (
             r"off by at most [0-3]\.",
             "connected: False",
         ),
+    ),
+    Client(
+        name="zenoh-ros2-sdk",
+        source="",
+        command=("{tools}/ros2_sdk.py", "{port}", "{folder}/robot.yaml", "{python}"),
+        emulator=("{folder}/robot.yaml", "--transport", "zenoh", "--port", "tcp/127.0.0.1:7461"),
+        packages=("zenoh-ros2-sdk==0.1.8",),
+        files=("ros2",),
+        must=(r"states in 1 s, joints \w+", r"off by at most 0\.0\d", "refused: True"),
     ),
     Client(
         name="SO101Follower",
