@@ -81,9 +81,15 @@ class _AmpLearner(PpoLearner):
         self._discriminator = layers(2 * features, DISCRIMINATOR, 1).to(self._device)
         self.optimisers.append(torch.optim.Adam(self._discriminator.parameters(), lr=DISCRIMINATOR_RATE))
         self._real = self._scaled(self._reference.pairs)
+        self._motion = np.empty((env.num_envs, features))
         self._pairs: list[torch.Tensor] = []
         self._styles: list[float] = []
         self._style: float | None = None
+
+    def begin(self, seed: int) -> None:
+        """Start the episodes."""
+        super().begin(seed)
+        self._motion = self._env.motion()
 
     def update(self, check: Callable[[], None]) -> dict[str, float]:
         """Roll out once, learn the policy, then the discriminator; call ``check`` before each step."""
@@ -97,9 +103,10 @@ class _AmpLearner(PpoLearner):
         return {"style": None if self._style is None else round(self._style, 4)}
 
     def _step(self, action: torch.Tensor) -> tuple[FloatArray, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-        before = self._env.motion()
+        before = self._motion
         reward, over, truncated = super()._step(action)
-        both = np.hstack([before, self._env.motion()])
+        self._motion = self._env.motion()
+        both = np.hstack([before, self._motion])
         # Where an episode is over, the second half is of the next one; a diverged member has no motion.
         usable = ~over & np.isfinite(both).all(axis=1)
         pairs = self._scaled(both[usable])

@@ -19,7 +19,15 @@ from deal_hw.policies.vector_env import Extrinsics, check_task
 from deal_hw.policy import CLIMBED, OBSTACLE_AXES, ObservationTerm, PolicySpec
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel, load_model
-from deal_hw.sim.legged.terrain import EDGE_M, BatchTerrain, Kind, Terrain, terrain_geoms, with_terrain
+from deal_hw.sim.legged.terrain import (
+    EDGE_M,
+    BatchTerrain,
+    Kind,
+    Scuffs,
+    Terrain,
+    terrain_geoms,
+    with_terrain,
+)
 from deal_hw.types import FloatArray
 
 AHEAD_M: Final = tuple(np.linspace(-0.4, 1.0, 15).tolist())
@@ -39,6 +47,8 @@ GROUND_M: Final = 0.1
 """Usual height of a platform [m]."""
 FREE_M: Final = 0.3
 """Distance from the edge within which the wanted height of a foot is another one [m]."""
+PRESS_M: Final = 0.3
+"""A robot may press against a front if a foot is nearer to an edge than this [m]; a shin has 0.213 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +66,10 @@ class ClimbTask(WalkTask):
         flat: Share of episodes without terrain.
         blind: Share of episodes in which nothing is told of the platform.
         top_weight: Reward of feet on the platform, mean over the feet.
+        torque_weight: Cost of the squared torques, summed over the joints [1/(N·m)²]. Its ratio to
+            ``tracking_weight`` is that of Unitree's unitree_rl_gym (``go2_config.py``: 2e-4 to 1).
+        scuff_weight: Cost of a tick in which a leg or the trunk presses against a front. For each body that
+            touches others have 0.05 (ZiwenZhuang/parkour, ``go2_field_config.py``) to 1 (legged_gym).
     """
 
     ticks: int = 300
@@ -68,6 +82,8 @@ class ClimbTask(WalkTask):
     flat: float = 0.1
     blind: float = 0.5
     top_weight: float = 2.0
+    torque_weight: float = 3e-4
+    scuff_weight: float = 0.5
     command_range: tuple[tuple[float, float], ...] = ((0.4, 0.8), (0.0, 0.0), (-0.3, 0.3))
     standing: float = 0.1
     zeroed: float = 0.0
@@ -76,6 +92,9 @@ class ClimbTask(WalkTask):
         # A class with slots has no super() without arguments.
         WalkTask.__post_init__(self)
         check_task(self, "top_weight")
+        for name in ("torque_weight", "scuff_weight"):
+            if not getattr(self, name) >= 0:
+                raise ConfigurationError(f"{name} must not be negative, got {getattr(self, name)!r}")
         if self.levels < 2:
             raise ConfigurationError(f"levels must be at least 2, got {self.levels}")
         for name in ("flat", "blind"):
@@ -102,7 +121,10 @@ class ClimbEnv(Go2Env):
     edge. And::
 
         top_weight share of the feet that are over the terrain and not below its surface
+        - torque_weight sum over joints of their squared torque
+        - scuff_weight where a leg or the trunk presses against a front
 
+    The last two are newer than the shipped policies.
     The observation is the walk's, and what the operator says of the platform: its distance, less the
     commanded way since then, and its height (of steps that of one); both are zero where nothing is told, as
     of slopes. Height samples ahead are for the critic alone.
@@ -117,6 +139,7 @@ class ClimbEnv(Go2Env):
 
     Attributes:
         level: Level of each member, (N,); 0 is the lowest.
+        pressing: Whether each member pressed against a front in the last tick, (N,), before any restart.
 
     Raises:
         ConfigurationError: The description does not name four feet.
@@ -140,6 +163,7 @@ class ClimbEnv(Go2Env):
         self._nominal = [Terrain(kind=k, rise=task.ends_of(k)[0], distance_m=at) for k in task.terrains]
         self._terrain: BatchTerrain | None = None
         self.level = np.zeros(count, dtype=np.int64)
+        self.pressing: BoolArray = np.zeros(count, dtype=bool)
         self._climbed: BoolArray = np.zeros(count, dtype=bool)
         self._told: BoolArray = np.zeros(count, dtype=bool)
         self._tries = [deque[bool](maxlen=KEPT_TRIES) for _ in range(task.levels)]
@@ -147,6 +171,8 @@ class ClimbEnv(Go2Env):
         self._outcome = np.full(count, np.nan)
         super().__init__(description, distribution, count, task=task, threads=threads, engine=engine)
         self._terrain = BatchTerrain(self.loop.batch, task.terrains)
+        self._scuffs = Scuffs(self.loop.batch)
+        self._torque = self.loop.batch.engine.bind("actuator_force")
 
     @staticmethod
     def spec_of(description: RobotDescription, trained_under: str, task: WalkTask) -> PolicySpec:
@@ -242,8 +268,17 @@ class ClimbEnv(Go2Env):
         self._climbed |= (top & behind).all(axis=1)
         # Members that end are restarted before somebody asks.
         self._outcome = np.where(self.terrain.rise > 0.0, self._climbed, np.nan)
-        self._note(level=self.level.mean(), on_top=top.mean())
-        return np.asarray(reward + self.task.top_weight * top.mean(axis=1))
+        self.pressing = self._pressing_now()
+        effort = np.square(self._torque).sum(axis=1)
+        self._note(
+            level=self.level.mean(),
+            on_top=top.mean(),
+            pressing=self.pressing.mean(),
+            torque_nm=np.sqrt(np.nanmean(effort) / self._torque.shape[1]),
+        )
+        task = self.task
+        cost = task.torque_weight * effort + task.scuff_weight * self.pressing
+        return np.asarray(reward + task.top_weight * top.mean(axis=1) - cost)
 
     def reached(self) -> dict[str, float]:
         """Return the highest platform that most told robots climbed of late [m], as ``climbed_m``."""
@@ -271,6 +306,14 @@ class ClimbEnv(Go2Env):
     def outcomes(self) -> Mapping[str, FloatArray]:
         """Return whether all feet were on the (last) platform at once; NaN without terrain."""
         return {"climbed": self._outcome}
+
+    def _pressing_now(self) -> BoolArray:
+        """Return which robots press against a front, (N,); contacts are only looked for near an edge."""
+        feet = np.asarray(self._places[:, self._feet, 0])
+        near = (self.terrain.from_edge(feet) < PRESS_M).any(axis=1) & (self.terrain.rise > 0.0)
+        members = np.flatnonzero(near)
+        near[members] = self._scuffs.now(members)
+        return near
 
     def _feet_now(self) -> FloatArray:
         feet = super()._feet_now().copy()

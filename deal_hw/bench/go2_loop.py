@@ -1,14 +1,15 @@
 """The Go2's loop bench: walk, calibrate from the walk, fine-tune, walk again; the truths are hidden.
 
 One row per seed, in virtual time: driver, bytes, safety filter, control loop and recorder are those of the
-wire. Four policies do the same with the same robot. They are the shipped one of the task, and that one after
-more training under uniform randomisation, under the calibrated distribution, and under the truth.
+wire. Five policies do the same with the same robot. They are the shipped one of the task, and that one after
+more training under uniform randomisation, under the nominal model, under the calibrated distribution, and
+under the truth. A row that lacks policies is completed by those alone.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -32,12 +33,14 @@ from deal_hw.workflows.calibrate import calibrate
 from deal_hw.workflows.emulation.virtual_go2 import walk
 from deal_hw.workflows.emulation.walk_script import write_script
 from deal_hw.workflows.shipped import required_policy
-from deal_hw.workflows.train import train_policy, udr_distribution
+from deal_hw.workflows.train import nominal_distribution, train_policy, udr_distribution
 
-POLICIES: Final = ("udr", "udr_more", "calibrated", "oracle")
+POLICIES: Final = ("udr", "udr_more", "nominal", "calibrated", "oracle")
 WALK: Final = "walk"
 KINDS: Final = ("stiffness", "damping")
 KEY: Final = ("task", "profile", "seed", "steps")
+RIVALS: Final = {"nominal": "the nominal model", "udr_more": "UDR"}
+"""Trainings as long that read no recording, against which the calibrated one is compared."""
 
 
 def table(settings: Go2Loop) -> RowTable:
@@ -49,7 +52,14 @@ def table(settings: Go2Loop) -> RowTable:
     required_policy("go2", name)
     run = partial(loop_row, folder=settings.beside("runs"), threads=settings.cell_threads)
     args = [((name, settings.profile, seed, steps),) * 2 for seed in settings.seeds]
-    cells = Cells(names=KEY, run=run, args=args, tasks=settings.tasks(), bench=settings.name)
+    cells = Cells(
+        names=KEY,
+        run=run,
+        args=args,
+        tasks=settings.tasks(),
+        bench=settings.name,
+        whole=lambda row: not lacking(row),
+    )
     return RowTable(cells=cells, line=line, summary=printed(summary))
 
 
@@ -58,6 +68,7 @@ def loop_row(
     profile: str,
     seed: int,
     steps: int,
+    earlier: Row | None = None,
     *,
     folder: Path,
     threads: int | None,
@@ -70,11 +81,12 @@ def loop_row(
         profile: Profile of the emulated robot.
         seed: Seed of its truth, of the search and of the training.
         steps: Steps of each fine-tune; 0 for none.
+        earlier: The cell's row of an earlier version, without an error. It is completed: what it has is kept.
         folder: Folder of recordings and policies.
         threads: Simulation threads.
         task: What the robot does; by default that of the name.
     """
-    row: Row = {
+    head: Row = {
         "bench": "go2-loop",
         "task": name,
         "profile": profile,
@@ -82,18 +94,39 @@ def loop_row(
         "steps": steps,
         "error": "",
     }
-    task = task or TASKS[name or WALK]
+    task, row = task or TASKS[name or WALK], {**(earlier or head)}
     with noted_in(row):
         truth, out = draw_truth(profile, seed), folder / f"{name or WALK}_{profile}_{seed}"
         check_truth(walk_space(), truth.walk_parameters())
         out.mkdir(parents=True, exist_ok=True)
-        began = time.process_time()
-        dataset = recorded(truth, out, task)
-        found = calibrate(dataset=dataset, space="walk", holdout=1, seed=seed, threads=threads)
-        row |= calibration_part(found.result, truth)
-        row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
-        row |= policies_part(found.result, truth, steps, out, task)
+        under = uncalibrated(truth, task)
+        if earlier is None or "calibrated" in lacking(row):
+            began = time.process_time()
+            dataset = recorded(truth, out, task)
+            found = calibrate(dataset=dataset, space="walk", holdout=1, seed=seed, threads=threads)
+            row |= calibration_part(found.result, truth)
+            row["cpu_seconds_calibrate"] = round(time.process_time() - began, 1)
+            under["calibrated"] = found.result.distribution()
+        for policy in lacking(row):
+            row |= policy_part(policy, under.get(policy), truth, steps, out, task)
     return row
+
+
+def lacking(row: Row) -> list[str]:
+    """Return the policies of which a row has no numbers; without steps only the shipped one is asked for."""
+    measure = TASKS[row.get("task") or WALK].measure
+    return [n for n in POLICIES if (row["steps"] or n == "udr") and f"{measure}_{n}" not in row]
+
+
+def uncalibrated(truth: Go2Truth, task: LoopTask) -> dict[str, ParameterDistribution]:
+    """Return the distributions of the fine-tunes that need no calibration, by policy."""
+    space = walk_space()
+    values = np.array([truth.walk_parameters()[name] for name in space.names])
+    return {
+        "udr_more": udr_distribution("go2", task.name),
+        "nominal": nominal_distribution("go2", task.name),
+        "oracle": ParameterDistribution.point(space, values, 1e-3 * truth.latency_ms),
+    }
 
 
 def recorded(truth: Go2Truth, out: Path, task: LoopTask) -> Path:
@@ -140,29 +173,24 @@ def calibration_part(result: CalibrationResult, truth: Go2Truth) -> Row:
     return row
 
 
-def policies_part(result: CalibrationResult, truth: Go2Truth, steps: int, out: Path, task: LoopTask) -> Row:
-    """Fine-tune the shipped policy in three ways, and score all four; without steps the shipped one."""
-    space = walk_space()
-    values = np.array([truth.walk_parameters()[name] for name in space.names])
-    shipped = OnnxPolicy(required_policy("go2", task.name))
-    start = shipped.path.with_suffix(".safetensors")
-    under: Mapping[str, ParameterDistribution] = {
-        "udr_more": udr_distribution("go2", task.name),
-        "calibrated": result.distribution(),
-        "oracle": ParameterDistribution.point(space, values, 1e-3 * truth.latency_ms),
-    }
+def policy_part(
+    name: str,
+    under: ParameterDistribution | None,
+    truth: Go2Truth,
+    steps: int,
+    out: Path,
+    task: LoopTask,
+) -> Row:
+    """Fine-tune the shipped policy under a distribution, and score it; with None it is scored as it is."""
     row: Row = {}
-    for name in POLICIES if steps else POLICIES[:1]:
-        policy = shipped
-        if name != "udr":
-            began, file = time.process_time(), out / f"{name}.onnx"
-            files = TrainingFiles(checkpoint=file.with_suffix(".safetensors"), start=start)
-            policy = train_policy(
-                "go2", under[name], file, task=task.name, seed=truth.seed, steps=steps, files=files
-            )
-            row[f"cpu_seconds_train_{name}"] = round(time.process_time() - began, 1)
-        row |= {f"{key}_{name}": value for key, value in task.score(truth, policy, out).items()}
-    return row
+    policy = OnnxPolicy(required_policy("go2", task.name))
+    if under is not None:
+        began, file = time.process_time(), out / f"{name}.onnx"
+        start = policy.path.with_suffix(".safetensors")
+        files = TrainingFiles(checkpoint=file.with_suffix(".safetensors"), start=start)
+        policy = train_policy("go2", under, file, task=task.name, seed=truth.seed, steps=steps, files=files)
+        row[f"cpu_seconds_train_{name}"] = round(time.process_time() - began, 1)
+    return row | {f"{key}_{name}": value for key, value in task.score(truth, policy, out).items()}
 
 
 def line(row: Row) -> str:
@@ -179,7 +207,7 @@ def line(row: Row) -> str:
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
-    """Return a summary: medians, falls, and the paired comparison with equal training under UDR."""
+    """Return a summary: medians, falls, and the paired comparisons with equal training of :data:`RIVALS`."""
     if not rows:
         return []
     lines = [f"held-out ratio: median {np.median([row['heldout_ratio'] for row in rows]):.2f}"]
@@ -196,20 +224,23 @@ def summary(rows: Sequence[Row]) -> list[str]:
 
 
 def _compared(name: str, task: LoopTask, rows: Sequence[Row]) -> list[str]:
-    """Return how the policies did in one task."""
+    """Return how the policies did in one task; those of which every row has numbers, as robots differ."""
     lines, words = [], task.measure.replace("_", " ")
-    for policy in POLICIES:
+    policies = [n for n in POLICIES if all(f"{task.measure}_{n}" in row for row in rows)]
+    for policy in policies:
         found = [row[f"{task.measure}_{policy}"] for row in rows]
         falls = sum(row[f"{ENDED}_{policy}"] for row in rows)
         lines.append(f"{policy}: {words} {np.mean(found):.3f} {task.unit}, {falls} falls")
     if name == "climb":
-        lines += climb_lines(rows, POLICIES)
+        lines += climb_lines(rows, policies)
     sign = 1.0 if task.more_is_better else -1.0
-    gains = sign * np.array(
-        [row[f"{task.measure}_calibrated"] - row[f"{task.measure}_udr_more"] for row in rows]
-    )
-    lines.append(
-        f"calibrated against equal training under UDR, paired: {gains.mean():.4f} {task.unit} better on "
-        f"average, better for {int((gains > 0).sum())} of {len(gains)}"
-    )
+    for rival, means in RIVALS.items():
+        if rival in policies:
+            gains = sign * np.array(
+                [row[f"{task.measure}_calibrated"] - row[f"{task.measure}_{rival}"] for row in rows]
+            )
+            lines.append(
+                f"calibrated against equal training under {means}, paired: {gains.mean():.4f} {task.unit} "
+                f"better on average, better for {int((gains > 0).sum())} of {len(gains)}"
+            )
     return lines

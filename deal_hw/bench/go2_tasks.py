@@ -21,7 +21,7 @@ from deal_hw.parameters import ParameterDistribution
 from deal_hw.policies.climb_env import ClimbEnv, ClimbTask
 from deal_hw.policies.onnx_runtime import OnnxPolicy
 from deal_hw.robots import recorded_description
-from deal_hw.sim.legged.terrain import Kind, Scuffs, Terrain
+from deal_hw.sim.legged.terrain import Kind, Terrain
 from deal_hw.workflows.emulation.virtual_go2 import walk
 from deal_hw.workflows.emulation.walk_script import WALKS, Walk, write_script
 
@@ -180,7 +180,7 @@ def climbs(
     seen, _ = env.reset(seed=seed)
     going, climbed = np.ones(tries, dtype=bool), np.zeros(tries, dtype=bool)
     fell, pressing, scuffs = np.zeros(tries, dtype=bool), np.zeros(tries, dtype=bool), np.zeros(tries)
-    front, torque = Scuffs(env.loop.batch), env.loop.batch.engine.bind("actuator_force")
+    torque = env.loop.batch.engine.bind("actuator_force")
     squares, ticks = 0.0, 0
     for _ in range(env.ticks):
         seen, _, terminated, truncated, _ = env.step(policy.act_batch(seen))
@@ -188,9 +188,8 @@ def climbs(
         fell |= going & terminated
         going &= ~(terminated | truncated)
         left = np.flatnonzero(going)
-        pressed = front.now(left)
-        scuffs[left] += pressed & ~pressing[left]
-        pressing[left] = pressed
+        scuffs[left] += (env.pressing & ~pressing)[left]
+        pressing = env.pressing
         squares, ticks = squares + float(np.square(torque[left]).mean(axis=1).sum()), ticks + len(left)
     return ClimbTries(
         climbed=int((climbed & ~fell).sum()),

@@ -25,6 +25,8 @@ from deal_hw.types import FloatArray
 FORMAT = "deal_hw.bench/1"
 
 Row = dict[str, Any]
+Spec = tuple[tuple[Any, ...], tuple[Any, ...]]
+"""A cell that is to be run: the values that identify it, and its arguments."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,13 +39,30 @@ class Cells:
         args: For each cell the values of these fields, and the arguments.
         tasks: Does the cells: one after the other here, or in workers.
         bench: Name of the bench, for the rows of cells whose workers ended.
+        whole: Whether a row without an error has all that is measured now. If it has not, its cell is run
+            with the row as one more argument, and returns the row that takes its place.
     """
 
     names: Sequence[str]
     run: Callable[..., Row]
-    args: Sequence[tuple[tuple[Any, ...], tuple[Any, ...]]]
+    args: Sequence[Spec]
     tasks: TaskMap = field(default_factory=InThisProcess)
     bench: str = ""
+    whole: Callable[[Row], bool] = lambda row: True
+
+    def missing(self, rows: Sequence[Row]) -> list[Spec]:
+        """Return what is still to be run beside the rows that a file holds."""
+        valid = {self.key(row): row for row in rows if not row["error"] and not row.get("skipped")}
+        part = {cell: (row,) for cell, row in valid.items() if not self.whole(row)}
+        return [
+            (cell, (*args, *part.get(cell, ())))
+            for cell, args in self.args
+            if cell not in valid or cell in part
+        ]
+
+    def key(self, row: Row) -> tuple[Any, ...]:
+        """Return what identifies a row; "" for a field that it lacks."""
+        return tuple(row.get(name, "") for name in self.names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +99,7 @@ def printed(summary: Callable[[Sequence[Row]], Sequence[str]]) -> Callable[[Sequ
 def run_cells(
     cells: Cells, out: Path, after: Callable[[str, Row, list[Row]], None], program: str = "deal-hw"
 ) -> list[Row]:
-    """Run the cells without a valid row in a file, writing the file after each; return all rows.
+    """Run the cells without a valid, whole row in a file, writing the file after each; return all rows.
 
     Rows are written in the order of the cells, in whichever order they end. A Ctrl-C ends the cells that have
     begun; the rows of those that have ended are kept.
@@ -97,12 +116,7 @@ def run_cells(
         ClusterError: The workers cannot be used.
     """
     earlier = rows = load_rows(out)
-
-    def key(row: Row) -> tuple[Any, ...]:
-        return tuple(row.get(name, "") for name in cells.names)
-
-    valid = {key(row) for row in rows if not row["error"] and not row.get("skipped")}
-    missing = [(cell, args) for cell, args in cells.args if cell not in valid]
+    missing = cells.missing(rows)
     if not missing:
         return rows
 
@@ -121,13 +135,13 @@ def run_cells(
         for index, row in ended:
             found[index] = row
             made = {missing[i][0] for i in found}
-            rows = [row for row in earlier if key(row) not in made] + [found[i] for i in sorted(found)]
+            rows = [row for row in earlier if cells.key(row) not in made] + [found[i] for i in sorted(found)]
             save_rows(out, rows, program)
             after(f"{len(cells.args) - len(missing) + len(found)}/{len(cells.args)}", row, rows)
     return rows
 
 
-def _run_cell(run: Callable[..., Row], spec: tuple[tuple[Any, ...], tuple[Any, ...]]) -> Row:
+def _run_cell(run: Callable[..., Row], spec: Spec) -> Row:
     return run(*spec[1])
 
 

@@ -175,6 +175,26 @@ def test_a_task_without_a_reference_is_refused() -> None:
         AmpConfig(passes=0)
 
 
+def test_motions_are_computed_once_a_tick_and_are_those_before_the_next_one() -> None:
+    """Also of a robot that is restarted after two ticks: at the next step it does what was noted."""
+    from deal_hw.policies.amp import AmpConfig, AmpTrainer
+
+    class Watched(CanterEnv):
+        def motion(self) -> Any:
+            noted.append(super().motion())
+            return noted[-1]
+
+        def step(self, actions: Any) -> Any:
+            np.testing.assert_array_equal(noted[-1], super().motion())
+            return super().step(actions)
+
+    noted: list[Any] = []
+    env = Watched(GO2, nominal_distribution("go2", "canter"), 3, task=CanterTask(ticks=2))
+    config = AmpConfig(steps=24, rollout=4, hidden=(16,))
+    AmpTrainer().train(env, config, np.random.default_rng(0))
+    assert len(noted) == 1 + config.steps // env.num_envs
+
+
 @pytest.mark.slow
 def test_a_training_begins_from_the_networks_of_ppo(tmp_path: Path) -> None:
     """At first it does what the start does; its checkpoint is no start of PPO."""

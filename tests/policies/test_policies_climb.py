@@ -30,6 +30,8 @@ from deal_hw.workflows.shipped import required_policy
 from deal_hw.workflows.train import nominal_distribution
 
 GO2 = recorded_description("go2")
+FREE: dict[str, Any] = {"torque_weight": 0.0, "scuff_weight": 0.0}
+"""Settings without the costs of torque and of scuffing."""
 
 
 def make(count: int = 8, **task: object) -> ClimbEnv:
@@ -66,6 +68,48 @@ def test_a_leg_that_presses_against_the_front_scuffs() -> None:
     front = Scuffs(env.loop.batch)
     np.testing.assert_array_equal(front.now(np.arange(3)), [True, False, False])
     np.testing.assert_array_equal(front.now(np.array([2, 0])), [False, True])
+
+
+def test_torque_and_scuffs_cost_as_their_weights_say() -> None:
+    """By hand: three like robots, one at a front; a tick costs 3e-4 for each (N·m)², and 0.5 for scuffing."""
+    task = ClimbTask()
+    assert (task.torque_weight, task.scuff_weight) == (3e-4, 0.5)
+    envs = [make(3, flat=0.0, rise_m=(0.1, 0.1), **weights) for weights in ({}, FREE)]
+    rewards = []
+    for env in envs:
+        env.reset(seed=0)
+        env.step(np.zeros((3, 12)))
+        feet = np.asarray(env._places[:, env._feet[:2], 0]).max(axis=1)
+        env.terrain.place(np.arange(3), np.array([0.1, 0.1, 0.0]), feet + np.array([0.01, 0.3, 0.01]))
+        rewards.append(env.step(np.full((3, 12), 0.1))[1])
+        np.testing.assert_array_equal(env.pressing, [True, False, False])
+    squared = np.square(envs[0].loop.batch.engine.bind("actuator_force")).sum(axis=1)
+    assert squared.min() > 10.0
+    np.testing.assert_allclose(rewards[1] - rewards[0], 3e-4 * squared + np.array([0.5, 0.0, 0.0]))
+    found = envs[0].measures()
+    assert found["pressing"] == pytest.approx(1.0 / 6.0)
+    assert found["torque_nm"] > 0.0
+
+
+def test_contacts_are_looked_for_wherever_a_robot_may_touch() -> None:
+    """Over a shipped climb's tries of 0.2 m the robots that scuff are those of a search among all robots."""
+    env, policy = make(12, flat=0.0, rise_m=(0.2, 0.2)), OnnxPolicy(required_policy("go2", "climb"))
+    env.observe_for(policy.spec)
+    seen, _ = env.reset(seed=1)
+    every, scuffed = Scuffs(env.loop.batch), 0
+    for _ in range(150):
+        seen, _, terminated, truncated, _ = env.step(policy.act_batch(seen))
+        same = ~(terminated | truncated)
+        np.testing.assert_array_equal(env.pressing[same], every.now(np.flatnonzero(same)))
+        scuffed += int(env.pressing.sum())
+    assert scuffed > 100
+
+
+@pytest.mark.parametrize("name", FREE)
+def test_a_cost_is_not_negative(name: str) -> None:
+    """It would be a reward for what is to be avoided."""
+    with pytest.raises(ConfigurationError, match=rf"{name} must not be negative, got -0\.1"):
+        make(1, **{name: -0.1})
 
 
 def test_the_commanded_way_is_taken_off_the_told_distance() -> None:
