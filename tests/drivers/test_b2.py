@@ -424,7 +424,7 @@ def test_a_standing_robot_stays_where_it_is_by_its_own_sensors(make_b2: Any) -> 
 # A run.
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_run_stands_up_holds_and_lies_down(seed: int) -> None:
     """Released from sport mode, behind the safety filter, with hidden payload and friction; then damped."""
     clock = VirtualClock(10**9)
