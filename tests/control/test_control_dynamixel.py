@@ -41,6 +41,7 @@ def record(folder: Path, seconds: float, *faults: str) -> tuple[EpisodeReport, T
     return report.episodes[-1], Dataset.open(folder / "set").read(0).trajectory
 
 
+@pytest.mark.slow
 def test_collect_records_a_whole_run(tmp_path: Path) -> None:
     """Homing by the stops, a chirp, states on the grid with commands in force, torque off at the end."""
     report, recorded = record(tmp_path, 2.0)

@@ -105,8 +105,9 @@ def test_a_program_that_is_stopped_leaves_a_passive_robot(
     assert row["exit_code"] == code
 
 
-@pytest.mark.parametrize(("robot", "wire"), [*GO2, CARTPOLE])
-@pytest.mark.parametrize("phase", [pytest.param("connecting", marks=SLOW), "running"])
+@SLOW
+@pytest.mark.parametrize(("robot", "wire"), [("go2", "zenoh"), ("go2", "dds"), CARTPOLE])
+@pytest.mark.parametrize("phase", ["connecting", "running"])
 def test_a_second_run_is_refused_and_never_takes_over(
     measure: Any, robot: str, wire: str, phase: str
 ) -> None:

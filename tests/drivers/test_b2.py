@@ -296,7 +296,7 @@ def make_b2(make_go2: Any) -> Callable[..., Any]:
     return lambda **options: make_go2(**{"truth": B2Truth.nominal(), **options})
 
 
-@pytest.mark.parametrize("mode", [0x0A, 0x01])
+@pytest.mark.parametrize("mode", [0x0A, pytest.param(0x01, marks=pytest.mark.slow)])
 def test_the_vendors_stand_example(make_b2: Any, mode: int) -> None:
     """It releases sport mode as the example does, stands, and lies down; no command is refused."""
     bench = make_b2(sport="ai")
