@@ -106,6 +106,10 @@ class PdMotors:
         self.constant = np.where(free, constant * self._alive, self.effort)
         self.brake = np.where(free, self._kd * self._alive, 0.0)
 
+    def contents(self) -> bytes:
+        """Return the bytes of parameters, command and state: motors with the same ones answer alike."""
+        return b"".join(np.asarray(value).tobytes() for value in vars(self).values())
+
     def warm(self, seconds: float) -> None:
         """Warm the motors by their efforts, and count the commands that dead ones miss."""
         steady = AMBIENT_C + self._heat_k_nm2 * self.effort * self.effort

@@ -163,6 +163,7 @@ def test_a_truth_is_drawn_in_the_space_that_is_searched(task: str, space: str) -
     assert np.all(case.theta != case.space.nominal)
 
 
+@pytest.mark.slow
 def test_a_truth_outside_its_range_is_refused_in_every_calibration_bench(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

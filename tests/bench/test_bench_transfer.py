@@ -159,7 +159,12 @@ def test_the_shipped_walk_is_the_base_of_the_go2(tmp_path: Path) -> None:
         ({"task": ("ant",)}, ConfigurationError, "a policy of cartpole; this bench runs ant"),
         ({"checkpoint": "twice"}, ConfigurationError, "a second policy of cartpole"),
         ({"checkpoint": "alone"}, ConfigurationError, "alone.safetensors is missing"),
-        ({"checkpoint": "nominal"}, ConfigurationError, "another distribution .* within a factor 5"),
+        pytest.param(
+            {"checkpoint": "nominal"},
+            ConfigurationError,
+            "another distribution .* within a factor 5",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_what_cannot_work_is_refused_before_long_work(

@@ -228,7 +228,7 @@ def recording(experiment: Experiment, monkeypatch: pytest.MonkeyPatch) -> list[M
     return seen
 
 
-@pytest.mark.parametrize("criterion", ["determinant", "mean"])
+@pytest.mark.parametrize("criterion", ["determinant", pytest.param("mean", marks=pytest.mark.slow)])
 def test_optimum_is_at_least_as_good_as_all_candidates(
     servo: RobotModel, monkeypatch: pytest.MonkeyPatch, criterion: str
 ) -> None:

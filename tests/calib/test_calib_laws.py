@@ -156,11 +156,11 @@ def slow(actuator: str, names: list[str]) -> ParameterSet:
 @pytest.mark.parametrize(
     ("actuator", "names"),
     [
-        (SERVO, ["friction_stribeck", "stribeck_speed"]),
-        (SERVO, ["friction_load"]),
-        (SERVO, ["free_speed"]),
+        slow(SERVO, ["friction_stribeck", "stribeck_speed"]),
+        slow(SERVO, ["friction_load"]),
+        slow(SERVO, ["free_speed"]),
         (SERVO, ["lag"]),
-        (SERVO, ["servo_dead_zone"]),
+        slow(SERVO, ["servo_dead_zone"]),
         slow(SERVO, ["servo_punch"]),
         (MOTOR, ["asymmetry"]),
         (MOTOR, ["dead_zone"]),

@@ -63,17 +63,12 @@ def small_problem() -> Problem:
     fit = d.fit
     samples = int(SECONDS * 200) + 1
     steps = int(fit.sample[samples - 1])
+    states = ("sample", "position", "velocity", "usable")
+    commands = ("target", "stiffness", "damping", "effort_limit", "speed_limit")
     short = dataclasses.replace(
         fit,
-        sample=fit.sample[:samples],
-        position=fit.position[:samples],
-        velocity=fit.velocity[:samples],
-        usable=fit.usable[:samples],
-        target=fit.target[:steps],
-        stiffness=fit.stiffness[:steps],
-        damping=fit.damping[:steps],
-        effort_limit=fit.effort_limit[:steps],
-        speed_limit=fit.speed_limit[:steps],
+        **{name: getattr(fit, name)[:samples] for name in states},
+        **{name: getattr(fit, name)[:steps] for name in commands},
     )
     return Problem(
         d.robot,
@@ -118,6 +113,7 @@ class TestDeal(MethodSuite):
         return case_of("deal", Budget(population=30, generations=20), 5e-3)
 
 
+@pytest.mark.slow
 class TestDealCritic(MethodSuite):
     """`deal-critic`: the critic's features alone, within 3 %."""
 
@@ -170,6 +166,7 @@ class TestDealPaperFlat(MethodSuite):
         return case_of("deal-paper-flat", Budget(population=10, generations=3), None)
 
 
+@pytest.mark.slow
 class TestDealPaperReplayed(MethodSuite):
     """`deal-paper-replay`: the same without the policy."""
 

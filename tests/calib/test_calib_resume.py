@@ -92,7 +92,9 @@ def whole_of(name: str) -> CalibrationResult:
     return run(method, make_problem(1e-3), budget, None, 0)
 
 
-@pytest.mark.parametrize("stop", [2, pytest.param(5, marks=pytest.mark.slow), 9])
+@pytest.mark.parametrize(
+    "stop", [pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow), 9]
+)
 def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
     """Whatever it was about: the first stage, a later one with moved start states, or a restart."""
     (method, budget), path = STAGED["eki"], tmp_path / "checkpoint.npz"
@@ -107,7 +109,7 @@ def test_eki_over_stages_and_restarts(tmp_path: Path, stop: int) -> None:
     assert resumed.provenance["restarts"] == whole.provenance["restarts"]
 
 
-@pytest.mark.parametrize("stop", [2, 4])
+@pytest.mark.parametrize("stop", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_deal_over_stages_of_a_noisy_recording(tmp_path: Path, stop: int) -> None:
     """Critic, its optimiser and generator, and the moved start states come back."""
     (method, budget), path = STAGED["deal"], tmp_path / "checkpoint.npz"

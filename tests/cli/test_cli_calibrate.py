@@ -181,6 +181,7 @@ def test_the_folder_of_the_files_is_printed_once(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().out == f"written to {folder}: result.json\n"
 
 
+@pytest.mark.slow
 def test_same_seed_same_result(dataset: Path, calibrated: Calibrated, tmp_path: Path) -> None:
     """Everything random comes from the seed."""
     again = calibrate(settings(dataset, out=tmp_path)).result

@@ -196,7 +196,11 @@ FILES |= {"actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"}
 
 @pytest.mark.parametrize(
     ("moment", "number"),
-    [("report.html", signal.SIGTERM), ("moving", signal.SIGINT), ("moving", signal.SIGTERM)],
+    [
+        ("report.html", signal.SIGTERM),
+        ("moving", signal.SIGINT),
+        pytest.param("moving", signal.SIGTERM, marks=pytest.mark.slow),
+    ],
 )
 def test_an_interrupt_at_the_end_leaves_whole_results(
     dataset: Path,

@@ -291,8 +291,8 @@ def test_only_a_late_deployment_is_made_again(loaded: None, capsys: pytest.Captu
     ("job", "number"),
     [
         ("collect", signal.SIGINT),
-        ("train", signal.SIGTERM),
-        ("deploy", signal.SIGINT),
+        pytest.param("train", signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param("deploy", signal.SIGINT, marks=pytest.mark.slow),
         pytest.param("collect", signal.SIGTERM, marks=pytest.mark.slow),
         pytest.param("train", signal.SIGINT, marks=pytest.mark.slow),
         pytest.param("deploy", signal.SIGTERM, marks=pytest.mark.slow),

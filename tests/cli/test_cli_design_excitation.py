@@ -58,6 +58,16 @@ def optimal(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An excitation of a family, which needs no search."""
+    path = tmp_path_factory.mktemp("run") / "multisine.json"
+    design_excitation(
+        DESIGN_EXCITATION.settings(robot="cartpole", out=path, family="multisine", seconds=2.0, quiet=True)
+    )
+    return path
+
+
 @pytest.mark.slow
 def test_optimal_is_written_with_what_it_will_tell(optimal: Path) -> None:
     """The file holds a plan for this robot and a predicted spread for each of the nine parameters."""
@@ -68,14 +78,16 @@ def test_optimal_is_written_with_what_it_will_tell(optimal: Path) -> None:
 
 
 @pytest.mark.parametrize("name_of_truth", TRUTHS)
-@pytest.mark.parametrize("kind", ["multisine", "chirp", "steps", "optimal"])
+@pytest.mark.parametrize(
+    "kind", ["multisine", "chirp", "steps", pytest.param("optimal", marks=pytest.mark.slow)]
+)
 def test_each_excitation_keeps_the_limits(
-    kind: str, name_of_truth: str, optimal: Path, tmp_path: Path
+    kind: str, name_of_truth: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     """Recorded through driver, bytes and safety module: the run ends by itself, no command was clipped."""
     name = kind
     if kind == "optimal":
-        name = str(optimal)
+        name = str(request.getfixturevalue("optimal"))
     elif kind == "steps":
         name = str(tmp_path / "steps.json")
         settings = DESIGN_EXCITATION.settings(
@@ -110,14 +122,14 @@ def test_seeds_give_other_multisines() -> None:
     assert np.max(np.abs(asked[2] - asked[0])) > 0.05
 
 
-def test_collect_finds_what_to_play(optimal: Path) -> None:
+def test_collect_finds_what_to_play(written: Path) -> None:
     """A family keeps SECONDS, a file says how long it is, no excitation leaves the profile."""
 
     def found(**settings: Any) -> tuple[str, float]:
         return _excitation(COLLECT.settings(robot="cartpole", port="x", **settings), RunView())
 
     assert found(excite="chirp", seconds=3.0) == ("chirp", 3.0)
-    assert found(excite=str(optimal)) == (str(optimal), 2.0)
+    assert found(excite=str(written)) == (str(written), 2.0)
     assert found() == ("", 4.0)
     with pytest.raises(ConfigurationError, match="--out RUN"):
         found(excite="optimal")
@@ -125,13 +137,13 @@ def test_collect_finds_what_to_play(optimal: Path) -> None:
         found(excite="sine")
 
 
-def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> None:
+def test_files_that_do_not_fit_are_refused(written: Path, tmp_path: Path) -> None:
     """Another robot's, or of another length than the run."""
     with pytest.raises(ConfigurationError, match="made for robot 'cartpole'"):
-        make_behaviour(RunPlan(robot="so101", motion="excite", excite=str(optimal), seconds=2.0), ARM)
+        make_behaviour(RunPlan(robot="so101", motion="excite", excite=str(written), seconds=2.0), ARM)
     with pytest.raises(ConfigurationError, match="is 2 s long"):
         make_behaviour(
-            RunPlan(robot="cartpole", motion="excite", excite=str(optimal), policy=POLICY, seconds=4.0),
+            RunPlan(robot="cartpole", motion="excite", excite=str(written), policy=POLICY, seconds=4.0),
             DESCRIPTION,
         )
     with pytest.raises(UnknownNameError, match="k99"):
@@ -140,12 +152,12 @@ def test_files_that_do_not_fit_are_refused(optimal: Path, tmp_path: Path) -> Non
         )
 
 
-def test_playing_needs_no_extra(optimal: Path) -> None:
-    """The control process plays an optimal excitation without torch, mujoco and scipy."""
+def test_playing_needs_no_extra(written: Path) -> None:
+    """The control process plays a written excitation without torch, mujoco and scipy."""
     code = (
         "import sys; from deal_hw.workflows.running.plan import RunPlan, make_behaviour; "
         "from deal_hw.robots import robot_description; import deal_hw.cli.collect; "
-        f"plan = RunPlan(robot='cartpole', motion='excite', excite={str(optimal)!r}, policy={POLICY!r}, "
+        f"plan = RunPlan(robot='cartpole', motion='excite', excite={str(written)!r}, policy={POLICY!r}, "
         "seconds=2.0); make_behaviour(plan, robot_description('cartpole')); "
         "print([m for m in ('torch', 'mujoco', 'scipy') if m in sys.modules])"
     )

@@ -103,7 +103,9 @@ def wrong_sign() -> Any:
     return values
 
 
-@pytest.mark.parametrize("values", [exchanged_legs(), wrong_sign()], ids=["legs", "sign"])
+@pytest.mark.parametrize(
+    "values", [pytest.param(exchanged_legs(), marks=pytest.mark.slow), wrong_sign()], ids=["legs", "sign"]
+)
 def test_what_would_fall_is_not_written(
     tmp_path: Path, verb: Callable[..., tuple[int, str, str]], values: Any
 ) -> None:

@@ -41,6 +41,7 @@ def record(folder: Path, seconds: float, *faults: str) -> tuple[EpisodeReport, T
     return report.episodes[-1], Dataset.open(folder / "set").read(0).trajectory
 
 
+@pytest.mark.slow
 def test_collect_records_a_whole_run(tmp_path: Path) -> None:
     """Homing by the stops, a chirp, states on the grid with commands in force, torque off at the end."""
     report, recorded = record(tmp_path, 2.0)
@@ -55,6 +56,7 @@ def test_collect_records_a_whole_run(tmp_path: Path) -> None:
     assert (recorded.command_sequence[armed][5:] >= 0).all()
 
 
+@pytest.mark.slow
 def test_an_overload_trips_the_run(tmp_path: Path) -> None:
     """The run is tripped with the servo's name, the motor is off, and the recording is whole."""
     report, recorded = record(tmp_path, 4.0, "--servo-overload-after-s", "0.5")

@@ -2,7 +2,7 @@
 
 `tools/measure_go2_faults.py` and `tools/measure_cartpole_faults.py` draw moments and repeat each row; here
 the worst rows run once, at a moment of their own. The emulator reports the robot's commands, never deal-hw.
-Rows of the cart-pole are short and no slow tests; those of the Go2 are, but one.
+`make test` runs some rows of the cart-pole; its other rows, and all of the Go2, are slow tests.
 """
 
 from __future__ import annotations
@@ -90,7 +90,11 @@ def test_a_go2_whose_wire_is_cut_as_the_run_ends_is_damped_when_it_is_back(measu
 
 @pytest.mark.parametrize(("robot", "wire"), [GO2[0], CARTPOLE])
 @pytest.mark.parametrize(
-    ("name", "code"), [("Ctrl-Z, then fg", 130), ("the supervisor stands still (SIGSTOP)", 130)]
+    ("name", "code"),
+    [
+        ("Ctrl-Z, then fg", 130),
+        pytest.param("the supervisor stands still (SIGSTOP)", 130, marks=SLOW),
+    ],
 )
 def test_a_program_that_is_stopped_leaves_a_passive_robot(
     measure: Any, robot: str, wire: str, name: str, code: int
@@ -101,7 +105,8 @@ def test_a_program_that_is_stopped_leaves_a_passive_robot(
     assert row["exit_code"] == code
 
 
-@pytest.mark.parametrize(("robot", "wire"), [*GO2, CARTPOLE])
+@SLOW
+@pytest.mark.parametrize(("robot", "wire"), [("go2", "zenoh"), ("go2", "dds"), CARTPOLE])
 @pytest.mark.parametrize("phase", ["connecting", "running"])
 def test_a_second_run_is_refused_and_never_takes_over(
     measure: Any, robot: str, wire: str, phase: str
@@ -123,7 +128,10 @@ def test_a_second_run_from_another_computer_is_refused(measure: Any) -> None:
 @pytest.mark.parametrize(("robot", "wire"), [*GO2, CARTPOLE])
 @pytest.mark.parametrize(
     ("name", "phase"),
-    [("dry run: a policy that hangs", ""), ("dry run: the control process is killed", "connecting")],
+    [
+        ("dry run: a policy that hangs", ""),
+        pytest.param("dry run: the control process is killed", "connecting", marks=SLOW),
+    ],
 )
 def test_a_dry_run_that_dies_has_told_the_robot_nothing(
     measure: Any, robot: str, wire: str, name: str, phase: str
@@ -134,7 +142,8 @@ def test_a_dry_run_that_dies_has_told_the_robot_nothing(
     assert (row["ends"], row["exit_code"]) == ("never commanded", 2)
 
 
-@pytest.mark.parametrize("wire", ["zenoh", pytest.param("dds", marks=SLOW)])
+@SLOW
+@pytest.mark.parametrize("wire", ["zenoh", "dds"])
 def test_a_run_that_is_killed_while_sport_mode_stands_commands_no_motor(measure: Any, wire: str) -> None:
     """Damping beside sport mode would make a standing robot shake or fall."""
     row = measure("go2", wire, "killed while taking over from sport mode, which stands", "taking over")

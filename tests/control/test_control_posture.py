@@ -230,7 +230,7 @@ def test_times_have_limits(name: str, value: float) -> None:
 
 @pytest.mark.parametrize(
     ("seed", "velocity", "seconds"),
-    [(None, (0.4, 0.0, 0.0), 3.0), (0, (0.0, 0.3, 0.0), 1.66)],
+    [pytest.param(None, (0.4, 0.0, 0.0), 3.0, marks=pytest.mark.slow), (0, (0.0, 0.3, 0.0), 1.66)],
     ids=["ahead", "left"],
 )
 def test_a_walk_ends_standing(seed: int | None, velocity: tuple[float, ...], seconds: float) -> None:

@@ -103,10 +103,12 @@ def start_emulator() -> Iterator[Callable[..., Emulator]]:
         emulator.close()
 
 
-@pytest.fixture
-def emulator(start_emulator: Callable[..., Emulator]) -> Emulator:
-    """A well-behaved one."""
-    return start_emulator()
+@pytest.fixture(scope="module")
+def emulator() -> Iterator[Emulator]:
+    """A well-behaved one, for all runs that leave a passive robot behind: each homes it anew."""
+    made = Emulator()
+    yield made
+    made.close()
 
 
 def children() -> dict[str, int]:
@@ -196,8 +198,9 @@ def test_replay_asks_for_what_was_recorded(emulator: Emulator, tmp_path: Path) -
     assert any(line.startswith("  difference from the recording at most ") for line in lines)
 
 
-def test_dry_run_leaves_the_motor_off(emulator: Emulator, tmp_path: Path) -> None:
+def test_dry_run_leaves_the_motor_off(start_emulator: Callable[..., Emulator], tmp_path: Path) -> None:
     """The commands are computed and recorded, and the device was never armed."""
+    emulator = start_emulator()
     report = run(emulator, tmp_path, seconds=0.7, dry=True)
     assert report.outcome is Outcome.FINISHED
     episode = read_episode(tmp_path / "episodes" / "000000.mcap")

@@ -183,6 +183,7 @@ def test_a_killed_control_process_leaves_the_robot_damped(rig: Rig, tmp_path: Pa
     assert read.trajectory.body is not None
 
 
+@pytest.mark.slow
 def test_the_end_key_lays_the_robot_down(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run of a minute ends 30 cycles after it stands, by a key on a terminal: stand, lie down, damping."""
     operator, program = pty.openpty()
@@ -206,7 +207,10 @@ def test_the_end_key_lays_the_robot_down(rig: Rig, tmp_path: Path, monkeypatch: 
     assert kinds(rig.finish())[-3:] == [DAMPING, STIFF, DAMPING]
 
 
-@pytest.mark.parametrize("numbers", [(signal.SIGHUP,), (signal.SIGTERM, signal.SIGHUP)])
+@pytest.mark.parametrize(
+    "numbers",
+    [(signal.SIGHUP,), pytest.param((signal.SIGTERM, signal.SIGHUP), marks=pytest.mark.slow)],
+)
 def test_a_session_that_ends_leaves_the_robot_damped(
     rig: Rig, tmp_path: Path, numbers: tuple[signal.Signals, ...]
 ) -> None:
@@ -230,6 +234,7 @@ def test_a_session_that_ends_leaves_the_robot_damped(
     assert len(Dataset.open(tmp_path / "dataset").read(0).trajectory.sent_s) > 40
 
 
+@pytest.mark.slow
 def test_a_run_ends_damped_before_this_computer_sleeps(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -296,7 +296,7 @@ def make_b2(make_go2: Any) -> Callable[..., Any]:
     return lambda **options: make_go2(**{"truth": B2Truth.nominal(), **options})
 
 
-@pytest.mark.parametrize("mode", [0x0A, 0x01])
+@pytest.mark.parametrize("mode", [0x0A, pytest.param(0x01, marks=pytest.mark.slow)])
 def test_the_vendors_stand_example(make_b2: Any, mode: int) -> None:
     """It releases sport mode as the example does, stands, and lies down; no command is refused."""
     bench = make_b2(sport="ai")
@@ -424,7 +424,7 @@ def test_a_standing_robot_stays_where_it_is_by_its_own_sensors(make_b2: Any) -> 
 # A run.
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_run_stands_up_holds_and_lies_down(seed: int) -> None:
     """Released from sport mode, behind the safety filter, with hidden payload and friction; then damped."""
     clock = VirtualClock(10**9)

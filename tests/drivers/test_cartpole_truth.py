@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES, k9_space
-from deal_hw.drivers.cartpole.emulator.lqr import design_lqr, linearise
+from deal_hw.drivers.cartpole.emulator import oracle
+from deal_hw.drivers.cartpole.emulator.lqr import LqrController, design_lqr, linearise
 from deal_hw.drivers.cartpole.emulator.oracle import balances, draw_truth, oracle_balances
 from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
 from deal_hw.drivers.cartpole.plant.profiles import PROFILES
@@ -98,6 +99,24 @@ def test_an_impossible_truth_is_refused() -> None:
     )
     assert oracle_balances(nominal)
     assert not oracle_balances(weak)
+
+
+def test_a_truth_that_is_drawn_again_is_not_balanced_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second draw of a seed is the same and simulates nothing; another seed's draw does."""
+    simulated: list[CartpoleTruth] = []
+
+    def noted(truth: CartpoleTruth, controller: LqrController, start_angle_rad: float) -> bool:
+        simulated.append(truth)
+        return True
+
+    monkeypatch.setattr(oracle, "balances", noted)
+    oracle._holds.cache_clear()
+    try:
+        first = draw_truth("sensor", 1)
+        assert draw_truth("sensor", 1) == first and simulated == [first] * 2
+        assert draw_truth("sensor", 2) != first and len(simulated) == 4
+    finally:
+        oracle._holds.cache_clear()
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:

@@ -20,6 +20,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_a_0102_program_releases_sport_mode_stands_the_robot_up_and_lays_it_down(
     dds_peer: Path, dds_domain: int
 ) -> None:

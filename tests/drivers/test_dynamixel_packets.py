@@ -96,6 +96,7 @@ def test_a_changed_byte_never_yields_another_packet(packets: list[tuple[int, byt
         assert (7, 1, b"") in found
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_random_inputs_do_not_upset_the_servos() -> None:
     """Bytes at random, and sound packets with a random inside: no exception, and then a ping works."""
     rng = np.random.default_rng(0)

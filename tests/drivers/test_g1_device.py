@@ -273,7 +273,7 @@ def play(
     return loop.run(), device
 
 
-@pytest.mark.parametrize("kind", [G1Robot, G1Dof23Robot])
+@pytest.mark.parametrize("kind", [G1Robot, pytest.param(G1Dof23Robot, marks=pytest.mark.slow)])
 def test_a_collected_run_finishes_and_ends_damped(kind: type[G1Robot]) -> None:
     """A multisine of every joint with hidden parameters; not one command is refused."""
     truth = draw_truth("sensor", 3, robot=kind.description.name)

@@ -390,7 +390,7 @@ def play(
     return loop.run(), device
 
 
-@pytest.mark.parametrize("motion", ["multisine", "chirp"])
+@pytest.mark.parametrize("motion", ["multisine", pytest.param("chirp", marks=pytest.mark.slow)])
 def test_a_collected_run_finishes_and_ends_damped(motion: str) -> None:
     """Every joint with hidden parameters; not one command is refused."""
     report, device = play(7.0, motion, H1Truth.draw("sensor", 3))

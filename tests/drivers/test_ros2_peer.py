@@ -62,6 +62,7 @@ def test_a_program_reads_and_moves_the_robot(ros2_peer: Path, dds_domain: int, r
     assert emulated.truth["commands_accepted"] > 50 and emulated.truth["commands_refused"] == 0
 
 
+@pytest.mark.slow
 def test_a_program_as_second_publisher_is_refused(
     ros2_peer: Path, dds_domain: int, robot: Path, tmp_path: Path
 ) -> None:

@@ -262,6 +262,7 @@ def test_collect_runs_without_extras(tmp_path: Path, port: str) -> None:
     assert reported.returncode == 0, reported.stderr
 
 
+@pytest.mark.slow
 def test_the_base_install_records_checks_and_converts(tmp_path: Path, port: str) -> None:
     """Over a serial port; recordings are shown and verified; a CSV file becomes a dataset."""
     run = functools.partial(run_bare, tmp_path, refused=EXTRAS + OF_ROBOT)

@@ -233,6 +233,7 @@ def test_a_checkpoint_tells_policies_and_wishes_apart(tmp_path: Path) -> None:
     assert digest(again) == digest(made[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["allegro", "humanoid"])
 def test_shipped_policies_do_their_tasks(robot: str) -> None:
     """16 robots of the distribution: the humanoid walks, and the hand turns most cubes to their targets."""

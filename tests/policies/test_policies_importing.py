@@ -174,7 +174,7 @@ def test_the_clock_at_rest(tmp_path: Path, imported: Callable[..., OnnxPolicy]) 
     assert imported(file).spec.clock_rest == 0.1
 
 
-@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("layers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_an_lstms_memory_is_input_and_output(
     tmp_path: Path, imported: Callable[..., OnnxPolicy], layers: int
 ) -> None:
@@ -216,7 +216,7 @@ def test_other_memories_are_refused_by_name(
         imported(tmp_path / "motion.pt", config)
 
 
-@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("layers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_isaac_labs_lstm_has_a_normaliser(
     tmp_path: Path, imported: Callable[..., OnnxPolicy], layers: int
 ) -> None:

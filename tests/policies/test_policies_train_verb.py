@@ -80,14 +80,23 @@ def test_threads_change_no_policy(tmp_path: Path) -> None:
 
 
 def test_a_gpu_that_is_not_there_is_said_before_the_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the remedy; --engine auto goes on without it, and says why."""
+    """With the remedy."""
     monkeypatch.setattr(warp_support, "gpu_problem", lambda: "no NVIDIA driver is installed")
     monkeypatch.setattr(warp_support, "find_spec", lambda name: True)
     with pytest.raises(ConfigurationError, match=r"needs a GPU, and no NVIDIA driver .* --engine mujoco"):
         train(TRAIN.settings(udr=True, engine="warp", out=tmp_path / "none"))
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.slow
+def test_a_training_chooses_mujoco_without_a_gpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """--engine auto goes on, and says why."""
+    monkeypatch.setattr(warp_support, "gpu_problem", lambda: "no NVIDIA driver is installed")
+    monkeypatch.setattr(warp_support, "find_spec", lambda name: True)
     made = train(TRAIN.settings(udr=True, engine="auto", out=tmp_path, steps=STEPS, members=8))
     assert "mujoco simulates the training: --engine warp needs a GPU" in capsys.readouterr().err
     assert made.path.exists()

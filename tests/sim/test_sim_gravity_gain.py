@@ -14,7 +14,7 @@ from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_the_truth_lies_within_four_standard_errors(seed: int, tmp_path: Path) -> None:
     """An arm of three joints, 6 s of motion: both loaded joints, and the vertical one says nothing."""
     robot = make_robot("arm", seed)

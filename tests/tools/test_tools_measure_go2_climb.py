@@ -24,6 +24,7 @@ class Still:
         return np.zeros((len(observations), 12))
 
 
+@pytest.mark.slow
 def test_a_low_edge_is_taken_by_walking_and_not_by_standing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over 2 cm most of six robots get; who stands still gets nowhere; the interval holds the share."""
     walk = OnnxPolicy(required_policy("go2"))

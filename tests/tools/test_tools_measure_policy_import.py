@@ -9,6 +9,7 @@ import measure_policy_import
 import pytest
 
 
+@pytest.mark.slow
 def test_a_row_for_each_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """And one for the sound policy; the last line counts."""
     chosen = ("diagonal legs exchanged", "actions")

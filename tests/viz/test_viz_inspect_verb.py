@@ -126,7 +126,7 @@ def test_without_a_desktop_other_ways_are_named(episode_file: Path, monkeypatch:
         deal_hw.inspect(episode_file).show()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_web_ends_with_its_server(episode_file: Path, number: signal.Signals) -> None:
     """Ctrl-C and SIGTERM end the verb in peace, and rerun's server with it."""
     command = [sys.executable, "-m", "deal_hw", "inspect", str(episode_file), "--web", "--web-port", "0"]

@@ -73,6 +73,7 @@ def recorded(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Recor
     return Recorded(out / "dataset", json.loads(output.splitlines()[-1]))
 
 
+@pytest.mark.slow
 def test_it_is_emulated_examined_and_recorded(recorded: Recorded) -> None:
     """The emulated motor followed the commands and was switched off; the recording holds the run."""
     modes = [what for _, _, what in recorded.truth["changes"]]
@@ -92,6 +93,7 @@ def test_its_recording_is_calibrated(recorded: Recorded) -> None:
     assert found["cart.mass"] == pytest.approx(recorded.truth["cart_kg"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_its_transport_reaches_the_robot(installed: Path, tmp_path: Path) -> None:
     """The same bytes through TCP; the control process goes on with the connection that its parent opened."""
     link = str(tmp_path / "cart")

@@ -70,7 +70,7 @@ CART = """<mujoco model="cart"><option timestep="0.002" integrator="implicitfast
 <actuator><motor joint="slide" gear="{gear}" ctrlrange="-1 1"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize("gear", [16, 30])
+@pytest.mark.parametrize("gear", [pytest.param(16, marks=pytest.mark.slow), 30])
 def test_a_cart_with_a_motor_stays_on_its_track(gear: int, tmp_path: Path) -> None:
     """25 and 50 m/s2, trips at 2 m/s: each excitation is played to its end, and the cart does move."""
     (tmp_path / "cart.xml").write_text(CART.format(gear=gear), encoding="utf-8")

@@ -28,7 +28,7 @@ WIRES = {"dds": "position", "zenoh": "trajectory"}
 """Wire -> kind of controller: each kind is driven on one of the two."""
 
 
-@pytest.fixture(params=WIRES, scope="module")
+@pytest.fixture(params=["dds", pytest.param("zenoh", marks=pytest.mark.slow)], scope="module")
 def wire(request: pytest.FixtureRequest) -> str:
     """The wire."""
     return str(request.param)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from arm_rig import BUSES, arm_file
+from arm_rig import arm_file
 
 import deal_hw
 from deal_hw.cli.main import EXIT_OK, main
@@ -19,7 +19,7 @@ from deal_hw.workflows.robot import carries_robot
 pytestmark = pytest.mark.real_time
 
 
-@pytest.fixture(params=BUSES, scope="module")
+@pytest.fixture(params=[pytest.param("dynamixel", marks=pytest.mark.slow), "feetech"], scope="module")
 def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The arm's robot.yaml; a state comes twice a command, so that a busy computer's late one costs less."""
     folder = tmp_path_factory.mktemp(request.param)

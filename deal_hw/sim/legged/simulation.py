@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -172,6 +174,23 @@ class LeggedSimulation:
         self._data.qacc_warmstart[:] = 0.0
         if self._free and height_m is not None:
             self._data.qpos[self._base_q : self._base_q + 7] = (0.0, 0.0, height_m, 1.0, 0.0, 0.0, 0.0)
+
+    def digest(self) -> bytes:
+        """Return a digest of model and state: two simulations with the same one move alike."""
+        model = np.empty(mujoco.mj_sizeModel(self._model), np.uint8)
+        mujoco.mj_saveModel(self._model, None, model)
+        part = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(self._model, part))
+        mujoco.mj_getState(self._model, self._data, state, part)
+        return hashlib.sha256(model.tobytes() + state.tobytes()).digest()
+
+    def save(self) -> mujoco.MjData:
+        """Return a copy of all that a step changes, for :meth:`load`."""
+        return copy.copy(self._data)
+
+    def load(self, saved: mujoco.MjData) -> None:
+        """Continue where a simulation of the same model was saved."""
+        self._data = copy.copy(saved)
 
     def push(self, force: Sequence[float]) -> None:
         """Push at the base from now on, (3,) [N] in the world; zeros end the push."""
