@@ -198,7 +198,7 @@ def read_robot_file(path: Path) -> RobotFile:
 
 
 def _with_off(values: Any) -> Any:
-    """Return the values of a file with the word ``off`` of ``hardware.passive``, which YAML 1.1 reads as false."""
+    """Return a file's values with the word ``off`` of ``hardware.passive``, which YAML 1.1 reads as false."""
     section = values.get("hardware") if isinstance(values, dict) else None
     if not isinstance(section, dict) or section.get("passive") is not False:
         return values
