@@ -27,7 +27,8 @@ HUNG, ZENOH = CraneOptions(hung_on_crane=True), H1LinkOptions(transport="zenoh")
 YAML = foreign_policy.h1_gym_yaml()
 LEGS = [DESCRIPTION.actuated.index(MOTORS[motor]) for motor in YAML["leg_joint2motor_idx"]]
 HELD = [k for k in range(len(DESCRIPTION.actuated)) if k not in LEGS]
-KICK_RAD = 3.0
+KICK = 12.0
+"""Action of a knee, about 3 rad."""
 
 
 @pytest.fixture(autouse=True)
@@ -44,20 +45,15 @@ def script(folder: Path, *, kicks: bool = False) -> Path:
     torch.manual_seed(1)
     module = Recurrent(1, 41, 10).eval()
     if kicks:
-        last = module.actor[-1]
-        assert isinstance(last, torch.nn.Linear)
-        for weights in module.actor.parameters():
-            torch.nn.init.zeros_(weights)
-        # The clock's sine goes through memory and layers, and becomes the knees' targets.
+        # The clock's sine, entry 39, is the cell's input; open gates let it through to the knees' targets.
+        weights = {name: torch.zeros_like(value) for name, value in module.state_dict().items()}
+        weights["memory.weight_ih_l0"][32, 39] = 3.0
+        weights["memory.bias_ih_l0"][16:32] = -5.0
+        weights["memory.bias_ih_l0"][[0, 48]] = 5.0
+        weights["actor.0.weight"][0, 0] = 1.0
         knees = [row for row, k in enumerate(LEGS) if "knee" in DESCRIPTION.actuated[k]]
-        for parameter in module.memory.parameters():
-            torch.nn.init.zeros_(parameter)
-        with torch.no_grad():
-            module.memory.weight_ih_l0[32, 39] = 3.0
-            module.memory.bias_ih_l0[16:32] = -5.0
-            module.memory.bias_ih_l0[[0, 48]] = 5.0
-            module.actor[0].weight[0, 0] = 1.0
-            last.weight[knees, 0] = 4.0 * KICK_RAD
+        weights["actor.2.weight"][knees, 0] = KICK
+        module.load_state_dict(weights)
     return foreign_policy.save_script(module, folder / "motion.pt")
 
 
