@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Protocol
 
 import numpy as np
@@ -21,12 +22,15 @@ from deal_hw.motions.behaviours import ActionMap, position_command
 from deal_hw.parameters import ParameterSpace
 from deal_hw.policies.servo_loop import BoolArray, ServoLoop
 from deal_hw.policy import AXES, Observation, ObservationBuilder, PolicySpec, base_features
+from deal_hw.sim.legged.floor import on_floor
 from deal_hw.types import FloatArray, JointCommand
 
 UNCOUNTED_S: Final = 1.5
 """First part of a walk, in which the robot gets up to speed; only falls count there [s]."""
 SETTLING_S: Final = 1.0
 """Time in which the robots settle in their default pose before [s]."""
+UNHUNG_SETTLING_S: Final = 0.2
+"""The same of robots that are set on a floor: humanoids fall soon without a policy [s]."""
 SPEED: Final = 0.5
 TURN: Final = 0.6
 """Commands of the trial, where the training range has them [m/s, rad/s]."""
@@ -142,9 +146,15 @@ TRIAL: Final = WalkingTrial()
 """The trial of an import: measured to find nearly all exchanged joints and signs (docs/measured)."""
 
 
-def can_try(spec: PolicySpec, description: RobotDescription) -> str:
-    """Return why a policy cannot be tried by walking; "" if it can."""
-    if description.floating_base is None or description.actuation != "position":
+def can_try(spec: PolicySpec, description: RobotDescription, feet: Sequence[str] = ()) -> str:
+    """Return why a policy cannot be tried by walking; "" if it can.
+
+    Args:
+        spec: The policy's spec.
+        description: The robot.
+        feet: Geoms of the feet of a robot that hangs in its own model.
+    """
+    if (description.floating_base is None and not feet) or description.actuation != "position":
         return f"robot {description.name!r} does not walk"
     if not any(term.quantity == "command" for term in spec.observation):
         return "the policy follows no commanded velocity"
@@ -179,18 +189,23 @@ def try_walking(
     description: RobotDescription,
     trial: WalkingTrial = TRIAL,
     *,
+    feet: Sequence[str] = (),
     threads: int | None = None,
 ) -> WalkingReport:
     """Let simulated robots walk with a policy, and others stand still.
+
+    A robot that hangs in its own model is set on a floor, in the policy's default pose and with its gains:
+    the robot's own are those for limbs in the air.
 
     Args:
         policy: The policy.
         description: The robot, as its driver describes it; :func:`can_try` must allow it.
         trial: How many robots walk for how long.
+        feet: Geoms of the feet of a robot that hangs in its own model; () for one that stands there.
         threads: Threads of the physics; None for all CPUs.
     """
     commands = trial_commands(policy.spec)
-    run = _Run(policy.spec, description, commands, trial, threads)
+    run = _Run(policy.spec, description, commands, trial, feet, threads)
     walks = run.walks(policy)
     clipped = run.clipped
     return WalkingReport(walks=walks, standing=run.walks(None), clipped=clipped, seconds=trial.seconds)
@@ -205,13 +220,27 @@ class _Run:
         description: RobotDescription,
         commands: Sequence[tuple[float, float, float]],
         trial: WalkingTrial,
+        feet: Sequence[str],
         threads: int | None,
     ) -> None:
+        hangs = bool(feet)
+        if hangs:
+            description = dataclasses.replace(
+                description,
+                default_position=spec.default_position,
+                stiffness=spec.stiffness,
+                damping=spec.damping,
+            )
         self._spec, self._description, self._commands = spec, description, commands
+        self._settling_s = UNHUNG_SETTLING_S if hangs else SETTLING_S
+        legs = description.limits.legs
+        # The limit of a robot that hangs is that of its crane.
+        self._tilt = TILT_RAD if hangs or legs is None else min(legs.tilt, TILT_RAD)
         self._robots, self._seed = trial.robots, trial.seed
         self._wanted = np.repeat(np.array(commands), trial.robots, axis=0)
         self._count = len(self._wanted)
-        self._loop = ServoLoop(description, ParameterSpace([]), self._count, threads=threads)
+        scene = partial(on_floor, feet=feet) if hangs else None
+        self._loop = ServoLoop(description, ParameterSpace([]), self._count, threads=threads, scene=scene)
         self._map = ActionMap.of_robot(spec, description)
         self._filter = SafetyFilter(description)
         self._ticks = round(trial.seconds * description.control_rate_hz)
@@ -252,11 +281,6 @@ class _Run:
         self.clipped = clips / self._ticks
         return self._judged(lasted / self._ticks, up, total / max(ticks, 1))
 
-    @property
-    def _tilt(self) -> float:
-        legs = self._description.limits.legs
-        return TILT_RAD if legs is None else min(legs.tilt, TILT_RAD)
-
     def _start(self, stand: FloatArray, rng: np.random.Generator) -> None:
         """Settle the robots in their default pose."""
         loop, description, count = self._loop, self._description, self._count
@@ -267,7 +291,7 @@ class _Run:
         command = self._repeated(description)
         loop.batch.set_sent(command.stiffness, command.damping, command.effort_limit)
         loop.restart(everyone, none, latency, start, np.zeros_like(start), rng, stand)
-        for _ in range(round(SETTLING_S * description.control_rate_hz)):
+        for _ in range(round(self._settling_s * description.control_rate_hz)):
             loop.step(stand, rng)
 
     def _home(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Emulated arms of servos for tests: two joints, on either bus, in virtual time."""
+"""Emulated arms of servos for tests: two joints, on either bus, in virtual time; two arms of seven joints."""
 
 from __future__ import annotations
 
@@ -49,6 +49,17 @@ MJCF = """
 </mujoco>
 """
 BUSES = ("dynamixel", "feetech")
+SEVEN = {
+    "shoulder_pan": "0 0 1",
+    "shoulder_lift": "0 1 0",
+    "upper_arm_roll": "1 0 0",
+    "elbow": "0 1 0",
+    "forearm_roll": "1 0 0",
+    "wrist_flex": "0 1 0",
+    "wrist_roll": "1 0 0",
+}
+"""Joints of an arm of seven, and their axes."""
+LINK_M, LINK_KG = 0.05, 0.06
 
 
 def arm_file(folder: Path, bus: str, **section: Any) -> RobotFile:
@@ -72,6 +83,51 @@ def arm_file(folder: Path, bus: str, **section: Any) -> RobotFile:
     )
     (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
     return file
+
+
+def two_arms_file(folder: Path, bus: str) -> RobotFile:
+    """Write MJCF and robot.yaml of a robot with two arms of seven joints on one bus; return the latter."""
+    joints = MJCF.partition("<worldbody>")[0]
+    arms = _arm("left", 0.15) + _arm("right", -0.15)
+    names = [f"{side}_{name}" for side in ("left", "right") for name in SEVEN]
+    motors = "".join(f'<position name="{name}" joint="{name}"/>' for name in names)
+    mjcf = folder / "arms.xml"
+    mjcf.write_text(
+        f"{joints}<worldbody>{arms}</worldbody><actuator>{motors}</actuator></mujoco>", encoding="utf-8"
+    )
+    own = derive_robot(mjcf, name="two arms", control_rate_hz=50.0, several_trees=True).file
+    file = dataclasses.replace(
+        own,
+        joints=tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints),
+        hardware=HardwareSection(
+            bus=bus,  # type: ignore[arg-type]
+            # 14 Dynamixel servos need the faster rate for 50 states a second.
+            baud_rate=2_000_000 if bus == "dynamixel" else 1_000_000,
+            passive="damping" if bus == "feetech" else "off",
+            servos=tuple(
+                ServoEntry(
+                    joint=name,
+                    id=number,
+                    zero=2048,
+                    direction=-1 if number % 2 else 1,
+                    p_gain=400 if bus == "dynamixel" else 32,
+                )
+                for number, name in enumerate(names, 1)
+            ),
+        ),
+    )
+    (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
+    return file
+
+
+def _arm(side: str, y: float) -> str:
+    """Return the bodies of an arm, each link at the end of the one before."""
+    links = "".join(
+        f'<body name="{side}_{name}_link" pos="{LINK_M} 0 0"><joint name="{side}_{name}" axis="{axis}"/>'
+        f'<geom fromto="0 0 0 {LINK_M} 0 0" mass="{LINK_KG}"/>'
+        for name, axis in SEVEN.items()
+    )
+    return f'<body name="{side}" pos="0 {y} 0.3">{links}{"</body>" * len(SEVEN)}</body>'
 
 
 class Rig:

@@ -70,6 +70,7 @@ def _unitree_wires(claim: str, doctor: str, *, emulated: bool = True) -> tuple[W
 
 _OF_GO2: Final = "deal_hw.drivers.unitree.claim:WireClaim", "deal_hw.drivers.go2.doctor:Go2Doctor"
 _OF_B2: Final = "deal_hw.drivers.b2.robot:B2Claim", "deal_hw.drivers.b2.doctor:B2Doctor"
+_FEET: Final = ("left_foot", "right_foot")
 _OF_H1: Final = "deal_hw.drivers.h1.robot:H1Claim", "deal_hw.drivers.h1.doctor:H1Doctor"
 _OF_G1: Final = "deal_hw.drivers.g1.robot:G1Claim", "deal_hw.drivers.g1.doctor:G1Doctor"
 
@@ -183,6 +184,7 @@ G1: Final = RobotEntry(
     spaces="deal_hw.drivers.g1.description:SPACES",
     truth="deal_hw.drivers.g1.emulator.truth:G1Truth",
     motors="deal_hw.drivers.g1.joints:JOINTS_29",
+    feet=_FEET,
 )
 G1_23DOF: Final = RobotEntry(
     name="g1_23dof",
@@ -194,6 +196,7 @@ G1_23DOF: Final = RobotEntry(
     machine="g1",
     truth="deal_hw.drivers.g1.emulator.truth:G1Truth",
     motors="deal_hw.drivers.g1.joints:JOINTS_23",
+    feet=_FEET,
 )
 H1: Final = RobotEntry(
     name="h1",
@@ -204,6 +207,7 @@ H1: Final = RobotEntry(
     spaces="deal_hw.drivers.h1.description:SPACES",
     truth="deal_hw.drivers.h1.emulator:H1Truth",
     motors="deal_hw.drivers.h1.joints:MOTORS",
+    feet=_FEET,
 )
 ALLEGRO: Final = RobotEntry(
     name="allegro",

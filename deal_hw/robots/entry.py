@@ -132,6 +132,8 @@ class RobotEntry:
             :class:`~deal_hw.drivers.unitree.emulated_truth.JointTruth`.
         motors: The joints in the order of the vendor's motor numbers, by which policies of other trainers
             name them.
+        feet: Geoms of the model's feet, for a robot that is driven only hung in the air: a policy of another
+            trainer is tried on a floor all the same.
         needs: What pip installs for it; named where an import fails.
         origin: The distribution of a plug-in and its version; "" for a robot of deal-hw.
     """
@@ -156,6 +158,7 @@ class RobotEntry:
     policies: Mapping[str, str] = field(default_factory=dict)
     truth: Reference = ""
     motors: Reference = ""
+    feet: tuple[str, ...] = ()
     needs: str = ""
     origin: str = ""
 

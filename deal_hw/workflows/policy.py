@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from deal_hw.data.files import write_bytes
-from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError, short
 from deal_hw.policy import IMPORTED, VERDICT, PolicySpec
 from deal_hw.ranges import Checked, Range
+from deal_hw.robots.entry import RobotEntry
 from deal_hw.workflows.options import FROM_PYTHON, File, OneWord, from_settings
 from deal_hw.workflows.policy_tables import joint_rows, policy_text, walk_text
 from deal_hw.workflows.robot import entry_of
@@ -198,7 +198,7 @@ def import_policy(settings: ImportPolicySettings) -> PolicyReport:
         adapter = adapter_of(policy, description)
         settings.say(policy_text(spec))
         write_bytes(draft, network.file(spec, adapter))
-        tried = _tried(draft, description, settings.say)
+        tried = _tried(draft, entry, settings.say)
         verdict = "red" if tried.faults else "amber" if tried.untried else "green"
         others = f", and at {len(tried.faults) - 1} other commands" if len(tried.faults) > 1 else ""
         found = {
@@ -227,7 +227,7 @@ def check_policy(settings: CheckPolicySettings) -> PolicyReport:
     path = Path(settings.policy)
     spec = read_policy(path)
     settings.say(policy_text(spec))
-    tried = _tried(path, entry_of(settings.robot or spec.robot).recorded_description(), settings.say)
+    tried = _tried(path, entry_of(settings.robot or spec.robot), settings.say)
     return dataclasses.replace(tried, path=None if tried.faults else path)
 
 
@@ -243,10 +243,11 @@ def read_policy(path: Path) -> PolicySpec:
         return policy.spec
 
 
-def _tried(path: Path, description: RobotDescription, say: Say) -> PolicyReport:
+def _tried(path: Path, entry: RobotEntry, say: Say) -> PolicyReport:
     """Return how a policy does on states of a robot, and on simulated robots that walk."""
     from deal_hw.policies.trial import TrialPolicy, TrialSettings, try_policy
 
+    description = entry.recorded_description()
     settings = TrialSettings(processor_s=PROCESSOR_S, time_limit_s=TIME_LIMIT_S)
     with TrialPolicy(path, settings) as policy:
         report = try_policy(policy, description)
@@ -259,14 +260,15 @@ def _tried(path: Path, description: RobotDescription, say: Say) -> PolicyReport:
             from deal_hw.policies.walking_trial import can_try, try_walking
         except ModuleNotFoundError as err:
             raise MissingExtraError(str(err.name), "sim") from err
-        untried = can_try(policy.spec, description)
+        untried = can_try(policy.spec, description, entry.feet)
         if not untried and policy.spec.recurrent and not policy.takes_batches:
             untried = "its recurrent network takes one observation at a time"
         if untried:
             say(f"not tried in the simulator: {untried}")
             return PolicyReport(path=path, spec=policy.spec, walk=None, untried=untried, faults=())
-        say(f"walking on simulated robots {description.name} ...")
-        walk = try_walking(policy, description)
+        floor = " on a floor, though it is driven on a crane only" if entry.feet else ""
+        say(f"walking on simulated robots {description.name}{floor} ...")
+        walk = try_walking(policy, description, feet=entry.feet)
     say(walk_text(walk))
     return PolicyReport(path=path, spec=report.spec, walk=walk, untried="", faults=walk.faults())
 

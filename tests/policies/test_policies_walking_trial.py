@@ -21,6 +21,7 @@ from deal_hw.policies.walking_trial import (
     try_walking,
 )
 from deal_hw.policy import Observation, PolicySpec
+from deal_hw.robots import robot_entry
 from deal_hw.types import FloatArray
 from deal_hw.workflows.shipped import required_policy
 
@@ -121,3 +122,42 @@ def test_who_cannot_walk_is_not_tried() -> None:
     ]
     for spec, description, said in cases:
         assert can_try(spec, description) == said
+
+
+def test_a_robot_that_hangs_is_set_on_a_floor() -> None:
+    """An H1's policy that holds its pose falls as soon as robots that stand still, and follows no command."""
+    entry = robot_entry("h1")
+    description = entry.recorded_description()
+    spec = dataclasses.replace(
+        SHIPPED.spec,
+        robot="h1",
+        joint_names=description.joint_names,
+        actuated=description.actuated,
+        default_position=description.default_position,
+        action_scale=(0.25,) * len(description.actuated),
+        stiffness=description.stiffness,
+        damping=description.damping,
+        effort_limit=description.effort_limit,
+        speed_limit=description.speed_limit,
+        position_units=description.position_units,
+        clock_hz=0.0,
+        observation=tuple(t for t in SHIPPED.spec.observation if t.quantity == "command"),
+    )
+    assert can_try(spec, description) == "robot 'h1' does not walk"
+    assert can_try(spec, description, entry.feet) == ""
+
+    class Holding:
+        def __init__(self) -> None:
+            self.spec = spec
+
+        def reset(self) -> None:
+            """It has no memory."""
+
+        def act_batch(self, observations: Observation) -> FloatArray:
+            return np.zeros((len(observations), len(spec.actuated)))
+
+    report = try_walking(Holding(), description, SHORT, feet=entry.feet, threads=1)
+    for walk, still in zip(report.walks, report.standing, strict=True):
+        assert 0.1 < walk.up < 0.9
+        assert walk.up == pytest.approx(still.up, abs=0.05)
+    assert len(report.faults()) == 6

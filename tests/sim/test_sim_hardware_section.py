@@ -124,6 +124,19 @@ def test_brakes_are_feetechs(tmp_path: Path) -> None:
         arm_file(tmp_path, "dynamixel", passive="damping")
 
 
+def test_off_needs_no_quotes(tmp_path: Path) -> None:
+    """YAML reads the bare word, as a user writes it by the page, as false."""
+    file = arm_file(tmp_path, "dynamixel")
+    path = tmp_path / "robot.yaml"
+    text = path.read_text(encoding="utf-8")
+    assert text.count("passive: 'off'") == 1
+    path.write_text(text.replace("passive: 'off'", "passive: off"), encoding="utf-8")
+    assert read_robot_file(path) == file
+    path.write_text(text.replace("passive: 'off'", "passive: on"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="passive is True"):
+        read_robot_file(path)
+
+
 def test_a_timestep_that_is_not_the_mjcfs_is_a_contradiction(tmp_path: Path) -> None:
     """The driver would describe another physics than the calibration."""
     file = dataclasses.replace(arm_file(tmp_path, "feetech"), physics_step=0.001)

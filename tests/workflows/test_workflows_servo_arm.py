@@ -6,12 +6,14 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
-from arm_rig import arm_file
+from arm_rig import BUSES, arm_file, two_arms_file
 
 import deal_hw
 from deal_hw.cli.main import EXIT_OK, main
 from deal_hw.control.process.channel import Outcome
+from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.errors import PolicyError
 from deal_hw.findings import Severity
 from deal_hw.workflows.robot import carries_robot
@@ -86,3 +88,23 @@ def test_stop_makes_it_passive(robot: Path, port: str, capsys: pytest.CaptureFix
     """From any terminal, by the file's name."""
     assert main(["stop", str(robot), "--port", port]) == EXIT_OK
     assert "is passive" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bus", BUSES)
+def test_two_arms_of_seven_joints_share_a_bus(bus: str, tmp_path: Path) -> None:
+    """14 servos at 50 Hz: every joint moves and is recorded, and a replay repeats it."""
+    file = two_arms_file(tmp_path, bus)
+    names = [joint.name for joint in file.joints]
+    assert len(names) == 14
+    robot = str(tmp_path / "robot.yaml")
+    with deal_hw.emulate(robot, profile="sensor", seed=1) as emulated:
+        port = emulated.port
+        report = deal_hw.collect(robot, port=port, out=tmp_path / "run", motion="chirp", seconds=4.0)
+        again = deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again")
+    assert report.outcome is again.outcome is Outcome.FINISHED
+    assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 150
+    found = read_trajectory(report.paths[0])
+    assert list(found.joint_names) == names and np.ptp(found.position, axis=0).min() > 0.05
+    difference = again.episodes[0].replay
+    assert difference is not None and difference.position.max() < 0.05

@@ -12,10 +12,10 @@ class Recurrent(torch.nn.Module):
     hidden_state: torch.Tensor
     cell_state: torch.Tensor
 
-    def __init__(self, layers: int) -> None:
+    def __init__(self, layers: int, observations: int = 47, actions: int = 12) -> None:
         super().__init__()
-        self.memory = torch.nn.LSTM(47, 16, layers)
-        self.actor = torch.nn.Sequential(torch.nn.Linear(16, 8), torch.nn.ELU(), torch.nn.Linear(8, 12))
+        self.memory = torch.nn.LSTM(observations, 16, layers)
+        self.actor = torch.nn.Sequential(torch.nn.Linear(16, 8), torch.nn.ELU(), torch.nn.Linear(8, actions))
         self.register_buffer("hidden_state", torch.zeros(layers, 1, 16))
         self.register_buffer("cell_state", torch.zeros(layers, 1, 16))
 

@@ -127,6 +127,16 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
         steps = 1.0 / (description.device_rate_hz * model.opt.timestep)
         step_s = model.opt.timestep if abs(steps - round(steps)) < 1e-6 else 1.0 / description.device_rate_hz
     model.opt.timestep = step_s
+    return robot_model(description, model)
+
+
+def robot_model(description: RobotDescription, model: mujoco.MjModel) -> RobotModel:
+    """Return a compiled model with the indices of a robot's joints, actuators and base, found by name.
+
+    Raises:
+        ConfigurationError: No actuator drives an actuated joint, or several do.
+        UnknownNameError: A joint of the description is not in the model.
+    """
     joints = [element_id(model, "joint", name) for name in description.joint_names]
     base = None
     if description.floating_base is not None:

@@ -194,7 +194,15 @@ def read_robot_file(path: Path) -> RobotFile:
             f"{path} is an MJCF, not a robot.yaml: make one with `deal-hw robot new {path}`, and name that"
         )
     with reading(path, "a robot (YAML)", ADVICE, error=ConfigurationError):
-        return from_values(RobotFile, read_yaml(path))
+        return from_values(RobotFile, _with_off(read_yaml(path)))
+
+
+def _with_off(values: Any) -> Any:
+    """Return a file's values with the word ``off`` of ``hardware.passive``, which YAML 1.1 reads as false."""
+    section = values.get("hardware") if isinstance(values, dict) else None
+    if not isinstance(section, dict) or section.get("passive") is not False:
+        return values
+    return {**values, "hardware": {**section, "passive": "off"}}
 
 
 _HEAD: Final = """\
