@@ -121,9 +121,10 @@ def run_cells(
         return rows
 
     def lost(cell: tuple[Any, ...], why: TaskLostError) -> Row:
-        # The other cells still run.
+        # The other cells still run. What was to be completed keeps its numbers.
         head = {"bench": cells.bench, **dict(zip(cells.names, cell, strict=True))}
-        return {**head, "error": f"{type(why).__name__}: {why}"}
+        known = next((row for row in earlier if cells.key(row) == cell), {})
+        return {**known, **head, "error": f"{type(why).__name__}: {why}"}
 
     found: dict[int, Row] = {}
     with cells.tasks as tasks, contextlib.ExitStack() as stack:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.util
 import re
 import socket
@@ -256,6 +257,16 @@ def test_a_lost_cell_is_a_row_with_its_error_and_is_run_again(tmp_path: Path) ->
     again = run_cells(_cells(InThisProcess(), (0, 1, 2)), out, lambda place, *_: places.append(place))
     assert places == ["3/3"] and [row["seed"] for row in again] == [9, 0, 2, 1]
     assert not any(row["error"] for row in again)
+
+
+def test_a_row_whose_completion_was_lost_keeps_its_numbers(tmp_path: Path) -> None:
+    """It has the error beside them."""
+    out, row = tmp_path / "rows.json", {"bench": "b", "seed": 1, "value": 1, "error": ""}
+    save_rows(out, [row])
+    lose = LastFirst(lose=[((1,), (1, row))])
+    cells = dataclasses.replace(_cells(lose, (1,)), whole=lambda one: "more" in one)
+    (lost,) = run_cells(cells, out, lambda *_: None)
+    assert lost["value"] == 1 and lost["error"] == "TaskLostError: its worker ended"
 
 
 def test_what_ended_before_a_ctrl_c_is_kept(tmp_path: Path) -> None:
