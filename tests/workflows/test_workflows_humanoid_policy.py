@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from fakes import foreign_policy
-from fakes.recurrent_modules import Recurrent
 
 import deal_hw
 from deal_hw.control.process.channel import Outcome
@@ -42,6 +40,10 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def script(folder: Path, *, kicks: bool = False) -> Path:
     """Write a small LSTM for an H1; one that kicks throws both knees from one end to the other."""
+    # Not while the tests are collected: torch takes seconds.
+    import torch
+    from fakes.recurrent_modules import Recurrent
+
     torch.manual_seed(1)
     module = Recurrent(1, 41, 10).eval()
     if kicks:
