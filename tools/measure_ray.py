@@ -1,12 +1,12 @@
 """What `--ray` costs beside the work: cells of half a minute, in this process and in workers.
 
 A row for each number of workers (0: this process). Cells are calibrations of a cart-pole (`bench fixed-range
---methods local`), which take about 30 processor seconds each. On a machine with other work, seconds say
+--methods default --profile realistic`), which take about 50 processor seconds each. On a machine with other work, seconds say
 little. So the overhead is counted in processor time: what this process and all of Ray's spend between the
 first task and the last, above what the cells spend themselves. The start, until each worker has loaded the
 libraries, is said apart.
 
-.venv/bin/python tools/measure_ray.py --seeds 0-1 --workers 0,1,2 --out measured.json
+.venv/bin/python tools/measure_ray.py --profile realistic --method default --seeds 0-1 --workers 0,1,2 --out measured.json
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ import json
 import time
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import psutil
 from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
-from deal_hw.bench.settings import FixedRange
+from deal_hw.bench.settings import FixedRange, Profile
 from deal_hw.scale.where import task_map
 
 
-def cell(seed: int, method: str) -> tuple[str, float]:
+def cell(seed: int, method: str, profile: Profile = "sensor") -> tuple[str, float]:
     """Calibrate one robot; return the row but for its time, as JSON, and the processor time [s]."""
     began = time.process_time()
-    (one,) = make_cells(FixedRange(methods=(method,), seeds=(seed,)))
+    (one,) = make_cells(FixedRange(methods=(method,), profile=profile, seeds=(seed,)))
     row = run_cell(one, population=None, generations=50, threads=1)
     del row["seconds"]
     return json.dumps(row, default=repr), time.process_time() - began
@@ -46,15 +46,18 @@ def processor_s() -> float:
     return total
 
 
-def measure(workers: int, seeds: Sequence[int], method: str) -> tuple[dict[str, Any], list[str]]:
+def measure(
+    workers: int, seeds: Sequence[int], method: str, profile: Profile
+) -> tuple[dict[str, Any], list[str]]:
     """Do the cells; return the row without its overhead, and the cells' own rows."""
     began = time.perf_counter()
     with task_map(f"local:{workers}" if workers else None) as tasks:
         tasks.map(load, range(2 * workers))
         start_s, spent, began = time.perf_counter() - began, processor_s(), time.perf_counter()
-        found = tasks.map(partial(cell, method=method), seeds)
+        found = tasks.map(partial(cell, method=method, profile=profile), seeds)
         row = {
             "method": method,
+            "profile": profile,
             "workers": workers,
             "cells": len(seeds),
             "start_s": start_s,
@@ -81,10 +84,11 @@ def main() -> None:
         "--workers", default="0,1,2", help="numbers of workers; 0, this process, comes first"
     )
     options.add_argument("--method", default="local", help="method of the cells")
+    options.add_argument("--profile", default="sensor", choices=get_args(Profile), help="of the robots")
     args = options.parse_args()
     rows, numbers = Rows(__file__, args.out), list[str]()
     for workers in map(int, args.workers.split(",")):
-        row, found = measure(workers, args.seeds, args.method)
+        row, found = measure(workers, args.seeds, args.method, args.profile)
         numbers = numbers or found
         row["equal"] = found == numbers
         row["overhead_percent"] = 100 * (row["cpu_seconds"] / row["cpu_seconds_cells"] - 1)
