@@ -1,12 +1,12 @@
 """What `--ray` costs beside the work: cells of half a minute, in this process and in workers.
 
-A row for each number of workers (0: this process). Cells are calibrations of a cart-pole (`bench fixed-range
---methods default --profile realistic`), which take about 50 processor seconds each. On a machine with other work, seconds say
-little. So the overhead is counted in processor time: what this process and all of Ray's spend between the
-first task and the last, above what the cells spend themselves. The start, until each worker has loaded the
-libraries, is said apart.
+A row for each number of workers (0: this process). Cells are calibrations of a cart-pole, as of `bench
+fixed-range`; with `--method default --profile realistic` they take about 50 processor seconds each. On a
+machine with other work, seconds say little. So the overhead is counted in processor time: what this process
+and all of Ray's spend between the first task and the last, above what the cells spend themselves. The start,
+until each worker has loaded the libraries, is said apart.
 
-.venv/bin/python tools/measure_ray.py --profile realistic --method default --seeds 0-1 --workers 0,1,2 --out measured.json
+.venv/bin/python tools/measure_ray.py --method default --profile realistic --workers 0,1,2 --out measured.json
 """
 
 from __future__ import annotations
