@@ -4,9 +4,9 @@
     python tools/check_clients.py FOLDER --only can_simple.py read_write.py --transcript clients.md
 
 FOLDER holds your own checkouts: ODriveResources (odriverobotics), DynamixelSDK (ROBOTIS-GIT),
-FTServo_Python (ftservo), lerobot (huggingface, v0.4.4: later versions need Python 3.12) and
-unitree_sdk2_python (unitreerobotics). What is not there is left out. Programs run unchanged, but for the
-port or bus that they open by name, and packages that they import and do not use, which are empty
+FTServo_Python (ftservo), physical-cartpole (SensorsINI), lerobot (huggingface, v0.4.4: later versions need
+Python 3.12) and unitree_sdk2_python (unitreerobotics). What is not there is left out. Programs run unchanged,
+but for the port or bus that they open by name, and packages that they import and do not use, which are empty
 (tools/clients/sitecustomize.py), in a terminal where this tool presses the keys. Each has its own emulator. A
 program that fails is run again, up to three times in all, because its time limits are short for a busy
 machine; table and transcript show at which try it passed, what was wrong before, and the load at each try.
@@ -35,9 +35,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import can
 from clients.programs import CLIENTS, Client
@@ -242,6 +243,8 @@ def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
     with contextlib.ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         write_files(client, work)
+        if client.plugin:
+            stack.enter_context(installed(client.plugin, work / "plugin"))
         words = [word.format(folder=work) for word in client.emulator]
         emulator = stack.enter_context(EmulatorProcess(*words))
         port = emulator.port.partition("?")[0].removeprefix("slcan:")
@@ -261,6 +264,18 @@ def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
             "DEAL_HW_CLIENT_UNUSED": ",".join(client.unused),
         }
         return run_in_terminal(command, client, work, environment)
+
+
+@contextlib.contextmanager
+def installed(plugin: str, into: Path) -> Iterator[None]:
+    """Install a package of this repository where programs that are started meanwhile find it."""
+    call = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", str(into)]
+    # pip builds in the folder that it is given.
+    source = shutil.copytree(TOOLS.parents[1] / plugin, into.with_name("source of the plug-in"))
+    subprocess.run([sys.executable, *call, str(source)], check=True)
+    paths = os.pathsep.join([str(into), *filter(None, [os.environ.get("PYTHONPATH")])])
+    with mock.patch.dict(os.environ, {"PYTHONPATH": paths}):
+        yield
 
 
 def python_of(client: Client, folder: Path, pip_args: list[str]) -> Path:

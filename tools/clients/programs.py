@@ -26,6 +26,7 @@ class Client:
         command: Arguments after Python; ``{source}``, ``{port}``, ``{tools}``, ``{folder}``, its working
             folder, and ``{python}``, that of deal-hw, are replaced.
         emulator: Arguments of ``deal-hw emulate``; ``{folder}`` is replaced.
+        plugin: Folder of this repository with a package that adds the robot, installed for the emulator.
         opens: The port or bus that the program opens by name; "" if it takes it as an argument.
         paths: Folders below the user's folder for PYTHONPATH.
         packages: Packages that it needs beside those of deal-hw.
@@ -51,6 +52,7 @@ class Client:
     source: str
     command: tuple[str, ...]
     emulator: tuple[str, ...]
+    plugin: str = ""
     opens: str = ""
     paths: tuple[str, ...] = ()
     packages: tuple[str, ...] = ()
@@ -197,6 +199,21 @@ CLIENTS: Final = (
             r"calibrated: True P gains: \{'shoulder_pan': 16, .*'gripper': 16\}",
             r"off by at most [0-3]\.",
             "connected: False",
+        ),
+    ),
+    Client(
+        name="physical-cartpole",
+        source="physical-cartpole/Driver/DriverFunctions",
+        command=("{tools}/bench_cartpole.py", "{port}"),
+        emulator=("bench_cartpole", "--profile", "ideal"),
+        plugin="examples/thirdparty",
+        paths=("physical-cartpole/Driver/DriverFunctions",),
+        unused=("pandas",),
+        must=(
+            "ping answered: True",
+            "calibrated: True",
+            r"motor commands \[1500\]",
+            r"moved by \d{3} counts",
         ),
     ),
     Client(
