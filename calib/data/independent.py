@@ -23,7 +23,8 @@ def in_order(
     counts do not depend on where it runs.
 
     Args:
-        problem: Recordings and simulator; sent to workers once, and simulated on one thread there.
+        problem: Recordings and simulator, simulated on one thread in workers. It is sent to them once, also
+            where the same function and problem are given in the next call.
         function: Pure, beside the count of the problem's steps; it does not run the problem's policy.
         specs: One small value for each fit.
     """
@@ -31,7 +32,9 @@ def in_order(
         yield from (function(problem, spec) for spec in specs)
         return
     found: dict[int, tuple[R, int]] = {}
-    work = partial(_counted, function, problem.on_one_thread())
+    work = problem.tasks.once(
+        (function, problem), lambda: partial(_counted, function, problem.on_one_thread())
+    )
     # Closed at once, which cancels what is left, and not when the memory is collected.
     with contextlib.closing(problem.tasks.completed(work, specs)) as completed:
         for index in range(len(specs)):

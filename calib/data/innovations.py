@@ -11,10 +11,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
+from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.noise import NOISE_FREE_STD
 from deal_hw.calib.data.problem import Problem, WindowData, measurements
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
@@ -119,10 +119,6 @@ def predict_population(
     parts = 1 if tasks.here or problem.engine != "mujoco" else min(tasks.workers, count)
     if parts <= (problem.threads or default_threads()):
         return predict(problem, members, data, position, velocity, population=True)
-    work = tasks.once(
-        (problem.robot, problem.space, *problem.episodes),
-        lambda: partial(_predict_some, problem.on_one_thread()),
-    )
     # Only windows and their start states are sent.
     nothing = np.empty((0, 0, 0))
     sent = dataclasses.replace(
@@ -131,15 +127,12 @@ def predict_population(
     if position is not None and velocity is not None:
         sent = dataclasses.replace(sent, start_position=position, start_velocity=velocity)
     rows = np.array_split(np.arange(count), parts)
-    found = tasks.map(work, [(Members(members.theta[r], members.latency_s[r]), sent) for r in rows])
-    problem.count(sum(steps for _, steps in found))
-    return np.concatenate([observed for observed, _ in found])
+    specs = [(Members(members.theta[r], members.latency_s[r]), sent) for r in rows]
+    return np.concatenate(list(in_order(problem, _predict_some, specs)))
 
 
-def _predict_some(problem: Problem, spec: tuple[Members, WindowData]) -> tuple[FloatArray, int]:
-    """Predict windows with some members, in a worker; return the measured channels and the physics steps."""
-    before = problem.steps
-    return predict(problem, *spec), problem.steps - before
+def _predict_some(problem: Problem, spec: tuple[Members, WindowData]) -> FloatArray:
+    return predict(problem, *spec)
 
 
 @dataclass(frozen=True, slots=True)
