@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from deal_hw.errors import ConfigurationError
 from deal_hw.policies.go2_env import Go2Env, WalkTask
 from deal_hw.policies.reference_motion import ReferenceMotion
+from deal_hw.policies.vector_env import check_task
 from deal_hw.types import FloatArray
 
 REFERENCE: Final = Path(__file__).parent / "assets" / "go2_canter_motion.npz"
@@ -113,8 +114,7 @@ class CanterTask(WalkTask):
     def __post_init__(self) -> None:
         # A class with slots has no super() without arguments.
         WalkTask.__post_init__(self)
-        if not self.schedule_weight >= 0:
-            raise ConfigurationError(f"schedule_weight must not be negative, got {self.schedule_weight!r}")
+        check_task(self, not_negative=("schedule_weight",))
 
 
 class CanterEnv(Go2Env):

@@ -91,10 +91,7 @@ class ClimbTask(WalkTask):
     def __post_init__(self) -> None:
         # A class with slots has no super() without arguments.
         WalkTask.__post_init__(self)
-        check_task(self, "top_weight")
-        for name in ("torque_weight", "scuff_weight"):
-            if not getattr(self, name) >= 0:
-                raise ConfigurationError(f"{name} must not be negative, got {getattr(self, name)!r}")
+        check_task(self, "top_weight", not_negative=("torque_weight", "scuff_weight"))
         if self.levels < 2:
             raise ConfigurationError(f"levels must be at least 2, got {self.levels}")
         for name in ("flat", "blind"):

@@ -35,8 +35,8 @@ NO_REFERENCE: Final = (
 )
 
 
-def check_task(task: Any, *positive: str) -> None:
-    """Check a task's settings: at least one tick, and those that must be positive, by name.
+def check_task(task: Any, *positive: str, not_negative: Sequence[str] = ()) -> None:
+    """Check a task's settings: at least one tick, and those that must be positive or not negative, by name.
 
     Raises:
         ConfigurationError: One is not.
@@ -46,6 +46,9 @@ def check_task(task: Any, *positive: str) -> None:
     for name in positive:
         if not getattr(task, name) > 0:
             raise ConfigurationError(f"{name} must be positive, got {getattr(task, name)!r}")
+    for name in not_negative:
+        if not getattr(task, name) >= 0:
+            raise ConfigurationError(f"{name} must not be negative, got {getattr(task, name)!r}")
 
 
 @dataclass(frozen=True, slots=True)
