@@ -16,7 +16,7 @@ from typing import Annotated, ClassVar, Final, Literal
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
-from deal_hw.scale.where import task_map
+from deal_hw.scale.where import check_device, task_map
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.task_map import TaskMap
 from deal_hw.workflows.calibration.settings import Recordings
@@ -137,11 +137,7 @@ class EngineBench(SpreadBench):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ray is not None and self.engine != "mujoco":
-            raise ConfigurationError(
-                f"--ray with --engine {self.engine}: the cells of all workers would share one device; leave "
-                "one of the two out"
-            )
+        check_device(self.ray, self.engine, "cells")
 
     def engine_of(self, method: str) -> EngineName | Literal[""]:
         """Return what simulates a method's populations, for its row; "" for mujoco."""

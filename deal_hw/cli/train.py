@@ -42,12 +42,11 @@ class ShownTraining(Quiet):
 KINDS = TRAIN.with_options(ShownTraining)
 
 
-def train(config: TrainSettings, quiet: bool | None = None) -> Training:
-    """Run the verb, or as quietly as asked; see :func:`deal_hw.workflows.train.train`."""
-    quiet = is_quiet(config) if quiet is None else quiet
+def train(config: TrainSettings) -> Training:
+    """Run the verb; see :func:`deal_hw.workflows.train.train`."""
     try:
-        if quiet or sys.stdout.isatty():
-            training = _with_bar(config, quiet)
+        if is_quiet(config) or sys.stdout.isatty():
+            training = _with_bar(config)
         else:
             with PipedProgress("train") as piped:
                 training = run(config, lambda status: piped.at(_words(status)), to_stderr)
@@ -89,7 +88,7 @@ def _train_seeds(config: TrainSettings, seeds: Sequence[int], ray: str | None) -
 
     def one(own: TrainSettings) -> Training:
         print(f"seed {own.seed}:")
-        return train(own, is_quiet(config))
+        return train(own)
 
     if ray is None:
         done = run_seeds(config, seeds, train=one)
@@ -132,7 +131,7 @@ def _print(training: Training) -> None:
         )
 
 
-def _with_bar(config: TrainSettings, quiet: bool) -> Training:
+def _with_bar(config: TrainSettings) -> Training:
     bar = Progress(
         TextColumn("training"),
         BarColumn(),
@@ -141,10 +140,10 @@ def _with_bar(config: TrainSettings, quiet: bool) -> Training:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        disable=quiet,
+        disable=is_quiet(config),
     )
     try:
-        return run(config, _follow(bar), silent if quiet else to_stderr)
+        return run(config, _follow(bar), silent if is_quiet(config) else to_stderr)
     finally:
         if bar.live.is_started:
             bar.stop()

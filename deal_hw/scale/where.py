@@ -49,6 +49,19 @@ def parse_where(text: str) -> Where:
     )
 
 
+def check_device(ray: str | None, engine: str, tasks: str) -> None:
+    """Refuse workers whose tasks, such as "cells", would be simulated on one device.
+
+    Raises:
+        ConfigurationError: Both are given.
+    """
+    if ray is not None and engine != "mujoco":
+        raise ConfigurationError(
+            f"--ray with --engine {engine}: the {tasks} of all workers would share one device; leave one of "
+            "the two out"
+        )
+
+
 def task_map(ray: str | None, threads: int | None = None) -> TaskMap:
     """Return what does tasks where `--ray` says.
 

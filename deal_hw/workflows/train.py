@@ -173,8 +173,6 @@ class Training:
     Attributes:
         policy: The policy, read back from its file.
         path: The .onnx file.
-        record: The .json file with the settings of the training.
-        checkpoint: The .safetensors file from which a training can continue.
         status: Progress at the end; None if it ended before the first update.
         first_return: Mean return of the first episodes; None if none ended. A new policy is then hardly
             trained. A resumed training has the return at its checkpoint.
@@ -182,10 +180,18 @@ class Training:
 
     policy: OnnxPolicy
     path: Path
-    record: Path
-    checkpoint: Path
     status: TrainingStatus | None
     first_return: float | None = None
+
+    @property
+    def record(self) -> Path:
+        """The .json file with the settings of the training."""
+        return self.path.with_suffix(".json")
+
+    @property
+    def checkpoint(self) -> Path:
+        """The .safetensors file from which a training can continue."""
+        return self.path.with_suffix(".safetensors")
 
     def table(self) -> str:
         """Return the training's progress and files, as text."""
@@ -289,8 +295,6 @@ def run(config: TrainSettings, progress: TrainingProgress, say: Say = silent) ->
     training = Training(
         policy=policy,
         path=path,
-        record=path.with_suffix(".json"),
-        checkpoint=checkpoint,
         status=reached[0] if reached else None,
         first_return=first[0] if first else None,
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.errors import ConfigurationError, TaskLostError, TrainingError
-from deal_hw.scale.where import task_map
+from deal_hw.scale.where import check_device, task_map
 from deal_hw.training import TrainingStatus
 from deal_hw.workflows.say import html_table, text_table
 from deal_hw.workflows.train import (
@@ -106,19 +106,17 @@ def run_seeds(
         raise ConfigurationError(
             f"seeds {', '.join(map(str, seeds)) or 'none'}: give one or more, each once, such as 0-4"
         )
-    config = _plain(config)
     engine = config.engine if isinstance(config, TrainRobotSettings) else "mujoco"
     threads = config.threads if isinstance(config, TrainRobotSettings) else 1
-    if ray is not None and engine != "mujoco":
-        raise ConfigurationError(
-            f"--ray with --engine {engine}: the trainings of all workers would share one device; leave out "
-            "one of the two"
-        )
+    check_device(ray, engine, "trainings")
     distribution_of(config)
     found: dict[int, Training] = {}
     failed: dict[int, str] = {}
     with task_map(ray, threads) as tasks:
-        work = partial(_train, config, (train or _alone) if tasks.here else None)
+        if tasks.here:
+            work = partial(_train, config, train or _alone)
+        else:
+            work = partial(_train, _plain(config), _packed)
         each = tasks.completed(work, seeds, _lost)
         with contextlib.closing(each) as completed:
             for index, result in completed:
@@ -181,24 +179,27 @@ class _Sent:
         return Training(
             policy=OnnxPolicy(path),
             path=path,
-            record=path.with_suffix(".json"),
-            checkpoint=path.with_suffix(".safetensors"),
             status=self.status,
             first_return=self.first_return,
         )
 
 
-def _train(config: TrainSettings, here: Trainer | None, seed: int) -> Training | _Sent | str:
-    """Train with one seed; return what ended it, if it could not go on. ``here`` is None in a worker."""
+def _train(
+    config: TrainSettings, train: Callable[[TrainSettings], Training | _Sent], seed: int
+) -> Training | _Sent | str:
+    """Train with one seed; return what ended it, if it could not go on."""
     try:
-        training = (here or _alone)(of_seed(config, seed))
+        return train(of_seed(config, seed))
     except TrainingError as err:
         return str(err)
-    return training if here is not None else _Sent.of(training)
 
 
 def _alone(config: TrainSettings) -> Training:
     return run(config, config.progress)
+
+
+def _packed(config: TrainSettings) -> _Sent:
+    return _Sent.of(_alone(config))
 
 
 def _lost(seed: int, why: TaskLostError) -> str:
