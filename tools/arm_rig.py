@@ -20,6 +20,7 @@ from deal_hw.errors import TransportTimeoutError
 from deal_hw.sim.robots.file_description import file_description
 from deal_hw.sim.robots.hardware_section import HardwareSection, ServoEntry
 from deal_hw.sim.robots.robot_file import RobotFile, write_robot_file
+from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
 from deal_hw.sim.robots.user_robot import derive_robot
 from deal_hw.testing.robot_suite import arm, default_command, run_cycles
@@ -60,6 +61,8 @@ SEVEN = {
 }
 """Joints of an arm of seven, and their axes."""
 LINK_M, LINK_KG = 0.05, 0.06
+_P_GAIN = {"dynamixel": 400, "feetech": 32}
+_PASSIVE: dict[str, Any] = {"dynamixel": "off", "feetech": "damping"}
 
 
 def arm_file(folder: Path, bus: str, **section: Any) -> RobotFile:
@@ -70,19 +73,12 @@ def arm_file(folder: Path, bus: str, **section: Any) -> RobotFile:
     mjcf = folder / "arm.xml"
     mjcf.write_text(MJCF, encoding="utf-8")
     own = derive_robot(mjcf, name="two joints", control_rate_hz=50.0).file
-    gain = 400 if bus == "dynamixel" else 32
     servos = (
-        ServoEntry(joint="shoulder", id=1, zero=2048, direction=-1, p_gain=gain),
-        ServoEntry(joint="elbow", id=2, zero=2000, p_gain=gain),
+        ServoEntry(joint="shoulder", id=1, zero=2048, direction=-1, p_gain=_P_GAIN[bus]),
+        ServoEntry(joint="elbow", id=2, zero=2000, p_gain=_P_GAIN[bus]),
     )
-    values = {"bus": bus, "servos": servos, "passive": "damping" if bus == "feetech" else "off", **section}
-    file = dataclasses.replace(
-        own,
-        joints=tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints),
-        hardware=HardwareSection(**values),
-    )
-    (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
-    return file
+    values = {"bus": bus, "servos": servos, "passive": _PASSIVE[bus], **section}
+    return write_driven(folder, own, HardwareSection(**values))
 
 
 def two_arms_file(folder: Path, bus: str) -> RobotFile:
@@ -96,26 +92,34 @@ def two_arms_file(folder: Path, bus: str) -> RobotFile:
         f"{joints}<worldbody>{arms}</worldbody><actuator>{motors}</actuator></mujoco>", encoding="utf-8"
     )
     own = derive_robot(mjcf, name="two arms", control_rate_hz=50.0, several_trees=True).file
-    file = dataclasses.replace(
-        own,
-        joints=tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints),
-        hardware=HardwareSection(
-            bus=bus,  # type: ignore[arg-type]
-            # 14 Dynamixel servos need the faster rate for 50 states a second.
-            baud_rate=2_000_000 if bus == "dynamixel" else 1_000_000,
-            passive="damping" if bus == "feetech" else "off",
-            servos=tuple(
-                ServoEntry(
-                    joint=name,
-                    id=number,
-                    zero=2048,
-                    direction=-1 if number % 2 else 1,
-                    p_gain=400 if bus == "dynamixel" else 32,
-                )
-                for number, name in enumerate(names, 1)
-            ),
+    section = HardwareSection(
+        bus=bus,  # type: ignore[arg-type]
+        # 14 Dynamixel servos need the faster rate for 50 states a second.
+        baud_rate=2_000_000 if bus == "dynamixel" else 1_000_000,
+        passive=_PASSIVE[bus],
+        servos=tuple(
+            ServoEntry(
+                joint=name, id=number, zero=2048, direction=-1 if number % 2 else 1, p_gain=_P_GAIN[bus]
+            )
+            for number, name in enumerate(names, 1)
         ),
     )
+    return write_driven(folder, own, section)
+
+
+def write_driven(
+    folder: Path, own: RobotFile, hardware: HardwareSection | Ros2Section, **more: Any
+) -> RobotFile:
+    """Write the robot.yaml of a robot that is driven, whose joints are limited; return its content.
+
+    Args:
+        folder: Where the file is written, beside the MJCF.
+        own: What the MJCF says.
+        hardware: What drives the joints.
+        more: Further fields of the file.
+    """
+    joints = tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints)
+    file = dataclasses.replace(own, joints=joints, hardware=hardware, **more)
     (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
     return file
 

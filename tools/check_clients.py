@@ -21,7 +21,6 @@ multicast, which a network of its own allows:
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import math
 import os
@@ -29,21 +28,21 @@ import pty
 import re
 import select
 import shlex
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from unittest import mock
 
 import can
 from clients.programs import CLIENTS, Client
 from dynamixel_sdk import PacketHandler, PortHandler
 from measuring import parser
+from plug_in import installed
+from ros2_rig import ros2_file
 
 from deal_hw.drivers.cartpole.emulator.odrive_endpoints import flat_endpoints
 from deal_hw.drivers.cartpole.wire.odrive_frames import (
@@ -57,9 +56,6 @@ from deal_hw.drivers.servo_bus.emulated_servo import BOOT_NS, KEEP_ID_AND_BAUD
 from deal_hw.drivers.so101.emulator import homed, limits_of
 from deal_hw.errors import TransportError
 from deal_hw.robots import recorded_description
-from deal_hw.sim.robots.robot_file import write_robot_file
-from deal_hw.sim.robots.ros2_section import Ros2Section
-from deal_hw.sim.robots.user_robot import derive_robot
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.own_robot.new import new_robot
 
@@ -180,21 +176,8 @@ def write_files(client: Client, folder: Path) -> None:
             for servo in homed().servos
         }
         (folder / "so101.json").write_text(json.dumps(motors))
-
     if "ros2" in client.files:
-        _write_ros2_robot(folder)
-
-
-def _write_ros2_robot(folder: Path) -> None:
-    """Write a robot.yaml of ros2_control with the SO-101's joints, beside its MJCF."""
-    source = Path(str(recorded_description("so101").mjcf))
-    shutil.copytree(source.parent, folder, dirs_exist_ok=True)
-    own = derive_robot(folder / source.name, name="an arm", control_rate_hz=50.0).file
-    joints = tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints)
-    names = tuple(joint.name for joint in joints)
-    section = Ros2Section(bus="ros2_control", controller="arm_controller", command="position", joints=names)
-    file = dataclasses.replace(own, state_rate_hz=100.0, joints=joints, hardware=section)
-    (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
+        ros2_file(folder)
 
 
 def prepare(client: Client, port: str) -> None:
@@ -244,7 +227,7 @@ def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         write_files(client, work)
         if client.plugin:
-            stack.enter_context(installed(client.plugin, work / "plugin"))
+            stack.enter_context(installed(TOOLS.parents[1] / client.plugin, work / "plug-in"))
         words = [word.format(folder=work) for word in client.emulator]
         emulator = stack.enter_context(EmulatorProcess(*words))
         port = emulator.port.partition("?")[0].removeprefix("slcan:")
@@ -264,18 +247,6 @@ def _once(client: Client, folder: Path, python: Path) -> tuple[str, int]:
             "DEAL_HW_CLIENT_UNUSED": ",".join(client.unused),
         }
         return run_in_terminal(command, client, work, environment)
-
-
-@contextlib.contextmanager
-def installed(plugin: str, into: Path) -> Iterator[None]:
-    """Install a package of this repository where programs that are started meanwhile find it."""
-    call = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", str(into)]
-    # pip builds in the folder that it is given.
-    source = shutil.copytree(TOOLS.parents[1] / plugin, into.with_name("source of the plug-in"))
-    subprocess.run([sys.executable, *call, str(source)], check=True)
-    paths = os.pathsep.join([str(into), *filter(None, [os.environ.get("PYTHONPATH")])])
-    with mock.patch.dict(os.environ, {"PYTHONPATH": paths}):
-        yield
 
 
 def python_of(client: Client, folder: Path, pip_args: list[str]) -> Path:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
-from arm_rig import MJCF
+from arm_rig import MJCF, write_driven
 
 from deal_hw.clock import VirtualClock
 from deal_hw.drivers.ros2.device import Ros2Device
@@ -23,7 +23,7 @@ from deal_hw.drivers.ros2.robot import Ros2ControlRobot
 from deal_hw.drivers.ros2.topics import topics_of
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.sim.robots.file_description import file_description
-from deal_hw.sim.robots.robot_file import RobotFile, write_robot_file
+from deal_hw.sim.robots.robot_file import RobotFile
 from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
 from deal_hw.sim.robots.user_robot import derive_robot
@@ -52,14 +52,7 @@ def ros2_file(folder: Path, command: str = "position", **section: Any) -> RobotF
         "names": {"elbow": "elbow_joint"},
         **section,
     }
-    file = dataclasses.replace(
-        own,
-        state_rate_hz=STATE_RATE_HZ,
-        joints=tuple(dataclasses.replace(joint, velocity_limit=6.0) for joint in own.joints),
-        hardware=Ros2Section(**values),
-    )
-    (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
-    return file
+    return write_driven(folder, own, Ros2Section(**values), state_rate_hz=STATE_RATE_HZ)
 
 
 class Ros2Rig:

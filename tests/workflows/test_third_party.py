@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import select
-import shutil
 import socket
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from plug_in import installed
 
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
@@ -27,19 +27,10 @@ SOURCE = Path(__file__).resolve().parents[2] / "examples" / "thirdparty"
 ROBOT = "bench_cartpole"
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+@pytest.fixture(scope="module", name="installed")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Install the package into a folder on the path of child processes; this process does not see it."""
-    folder = tmp_path_factory.mktemp("installed")
-    # A copy: building writes beside the sources.
-    copy = shutil.copytree(SOURCE, folder / "source", ignore=shutil.ignore_patterns("build", "*.egg-info"))
-    target = folder / "packages"
-    options = ["--no-build-isolation", "--no-deps", "--no-index", "--quiet", "--target", str(target)]
-    command = [sys.executable, "-m", "pip", "install", *options, str(copy)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(target), os.environ.get("PYTHONPATH", "")]))
+    with installed(SOURCE, tmp_path_factory.mktemp("installed")) as target:
         yield target
 
 

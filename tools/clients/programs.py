@@ -36,7 +36,7 @@ class Client:
             servos, except id and rate.
         files: Files in its working folder: "endpoints" and "config" of the emulated ODrive; "so101", an
             SO-101's robot.yaml and LeRobot's calibration of it; "homed", that of the emulated SO-101; "ros2",
-            a robot.yaml of ros2_control with the SO-101's joints.
+            a robot.yaml of ros2_control with two joints.
         servo_rate: Baud rate of the servos.
         keys: Pairs: what is printed, and the keys to press then; each once, in this order.
         hesitation_s: Time before a key is pressed [s]: a program sets the terminal up after its prompt, and
