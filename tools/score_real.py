@@ -1,0 +1,302 @@
+r"""Predict held-out motion of real robots, with laws that the MJCF lacks and without, beside other methods.
+
+    python tools/score_real.py FOLDER --robots so101,go2 --out real_robots.json
+    python tools/score_real.py --table real_robots.json
+
+FOLDER has a folder of each robot, as the converters write them from the public sources that they name:
+
+    so101       convert_so101.py; fits chirp_sweep, multisine, friction_gravity and prbs_excitation, holds out
+                step_response and slow_precision. so101-other holds out two of the fitted motions instead
+    go2         convert_go2_suspended.py --parts 4 --seconds 12.92; holds out the last part. go2-first: the first
+    cartpole    convert_cartpole.py, six recordings v1_*; holds out v1_800 and v1_1700
+    double_pendulum   the CSV files of docs/results/example-double-pendulum.md; holds out 02, 04 and 06
+    bam_xl330   convert_bam.py; fits the P gains 100, 200 and 800, holds out 400
+
+All methods get the same recordings, parameters and ranges:
+
+    nominal     the MJCF as it is
+    one-page    least squares as one writes it in an afternoon (tools/one_page.py), with the latency
+    mujoco-sysid   MuJoCo's own toolbox, with the latency as one more parameter; not for several P gains
+    no-laws     `deal-hw calibrate --no-laws`
+    default     `deal-hw calibrate`
+
+Errors are of predictions from smoothed reported states, root mean square over all windows, mean of the joints:
+in rad (cart-pole: m and rad), and as a share of the signal's range.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import one_page
+from measuring import Row, Rows, markdown, parser, read_rows
+
+from deal_hw.bench.first_answer import GO2_PARAMETERS, SO101_PARAMETERS
+from deal_hw.bench.rows import noted_in
+from deal_hw.calib.baselines.sysid import with_delay
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.report.verdict import trust
+from deal_hw.calib.validation.metrics import HeldOut
+from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.recordings.parts import joined
+from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
+from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.settings import FilesSettings
+
+METHODS = ("nominal", "one-page", "mujoco-sysid", "no-laws", "default")
+SYSID_ITERATIONS = 200
+"""Its own default."""
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A real robot.
+
+    Attributes:
+        inputs: Returns the inputs of a calibration from the robot's folder and one for files that it writes.
+        window_s: Length of held-out predictions [s].
+        fitted_s: Length of the windows that the other methods fit [s]; short for a motion that is unstable.
+        folder: Name of its folder.
+    """
+
+    inputs: Callable[[Path, Path], FilesSettings]
+    window_s: float
+    fitted_s: float
+    folder: str
+
+
+SO101_MOTIONS = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
+SO101_OTHERS = ("step_response", "slow_precision")
+SO101_SWAPPED = ("chirp_sweep", "friction_gravity")
+
+
+def so101(held_out: Sequence[str]) -> Callable[[Path, Path], FilesSettings]:
+    """Return the inputs of the SO-101 with these motions held out; see docs/results/example-so101.md."""
+    from deal_hw.drivers.so101.description import DESCRIPTION
+
+    def inputs(folder: Path, made: Path) -> FilesSettings:
+        (made / "so101.yaml").write_text(SO101_PARAMETERS, encoding="utf-8")
+        fitted = [name for name in (*SO101_MOTIONS, *SO101_OTHERS) if name not in held_out]
+        return FilesSettings(
+            model=DESCRIPTION.mjcf,
+            data=_npz(folder, fitted),
+            holdout=_npz(folder, held_out),
+            parameters=made / "so101.yaml",
+            columns=folder / "columns.yaml",
+            leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
+            fit_seconds=30.0,
+            physics_step=0.004,
+        )
+
+    return inputs
+
+
+def go2(held_out: int) -> Callable[[Path, Path], FilesSettings]:
+    """Return the inputs of the Go2 on its stand with a part held out, of 1 to 4."""
+    from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
+
+    def inputs(folder: Path, made: Path) -> FilesSettings:
+        (made / "go2.yaml").write_text(GO2_PARAMETERS, encoding="utf-8")
+        fitted = [f"traj_0_part{number}" for number in range(1, 5) if number != held_out]
+        return FilesSettings(
+            model=DESCRIPTION.mjcf,
+            data=_npz(folder, fitted),
+            holdout=_npz(folder, [f"traj_0_part{held_out}"]),
+            parameters=made / "go2.yaml",
+            columns=folder / "columns.yaml",
+            window=0.2,
+        )
+
+    return inputs
+
+
+def cartpole(folder: Path, made: Path) -> FilesSettings:
+    """Return the inputs of the cart-pole; the rotor's inertia is in its MJCF."""
+    del made
+    return FilesSettings(
+        model=folder / "cartpole.xml",
+        data=_npz(folder, ["v1_0", "v1_1", "v1_5", "v1_1200"]),
+        holdout=_npz(folder, ["v1_800", "v1_1700"]),
+        columns=folder / "columns.yaml",
+    )
+
+
+def double_pendulum(folder: Path, made: Path) -> FilesSettings:
+    """Return the inputs of the double pendulum; see docs/results/example-double-pendulum.md."""
+    del made
+    files = [folder / f"trajectory_{number:02}.csv" for number in range(7)]
+    held_out = (2, 4, 6)
+    return FilesSettings(
+        model=folder / "double_pendulum.xml",
+        data=_there([f for number, f in enumerate(files) if number not in held_out]),
+        holdout=_there([files[number] for number in held_out]),
+        columns=folder / "columns.yaml",
+    )
+
+
+def bam_xl330(folder: Path, made: Path) -> FilesSettings:
+    """Return the inputs of the XL330 with a weight: a set-up for each P gain."""
+    del made
+    motions = ("sin_sin", "sin_time_square", "up_and_down")
+    return FilesSettings(
+        model=folder / "pendulum.xml",
+        data=_npz(folder, [f"kp{gain}-{motion}" for gain in (100, 200, 800) for motion in motions]),
+        holdout=_npz(folder, [f"kp400-{motion}" for motion in motions]),
+        columns=folder / "columns.yaml",
+        parameters=folder / "parameters.yaml",
+        setups=folder / "setups.yaml",
+    )
+
+
+ROBOTS: Mapping[str, Robot] = {
+    "so101": Robot(so101(SO101_OTHERS), 5.0, 2.0, "so101"),
+    "so101-other": Robot(so101(SO101_SWAPPED), 5.0, 2.0, "so101"),
+    "go2": Robot(go2(4), 2.5, 2.0, "go2"),
+    "go2-first": Robot(go2(1), 2.5, 2.0, "go2"),
+    "cartpole": Robot(cartpole, 0.2, 0.2, "cartpole"),
+    "double_pendulum": Robot(double_pendulum, 0.2, 0.2, "double_pendulum"),
+    "bam_xl330": Robot(bam_xl330, 1.0, 1.0, "bam_xl330"),
+}
+
+
+def _npz(folder: Path, names: Sequence[str]) -> tuple[Path, ...]:
+    return _there([folder / f"{name}.npz" for name in names])
+
+
+def _there(files: Sequence[Path]) -> tuple[Path, ...]:
+    if missing := [str(path) for path in files if not path.exists()]:
+        raise ConfigurationError(f"{', '.join(missing)} missing: --help names the converter that makes them")
+    return tuple(files)
+
+
+def score(robot: Robot, folder: Path, method: str, seed: int) -> Row:
+    """Fit with one method and predict what was held out.
+
+    Raises:
+        DealHwError: A recording is missing, or the method cannot fit it.
+    """
+    with tempfile.TemporaryDirectory() as made:
+        config = robot.inputs(folder / robot.folder, Path(made))
+        work = calibration_input(config)
+    began, cpu = time.monotonic(), time.process_time()
+    space, theta, latency_s, more = fitted(robot, config, work, method, seed)
+    row = {"seconds": time.monotonic() - began, "processor_seconds": time.process_time() - cpu}
+    held_out = HeldOut(work.robot, work.space, work.holdout, robot.window_s, threads=1).of(space)
+    errors = held_out.errors({"fit": (theta, latency_s)})
+    unit = space.normalize(theta)
+    return row | {
+        "parameters": len(space),
+        "fitted_s": float(sum(len(e.sample) * e.period_s for e in work.episodes)),
+        "window_s": robot.window_s,
+        "rmse": errors.mean()["fit"],
+        "rmse_null": errors.mean()["null"],
+        "share": errors.nrmse["fit"],
+        "by_joint": dict(zip(errors.names, map(float, errors.rmse["fit"]), strict=True)),
+        "latency_s": latency_s,
+        "at_bound": [n for n, u in zip(space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6],
+        "estimate": dict(zip(space.names, map(float, theta), strict=True)),
+        **more,
+    }
+
+
+def fitted(
+    robot: Robot, config: FilesSettings, work: CalibrationInput, method: str, seed: int
+) -> tuple[ParameterSpace, Any, float, Row]:
+    """Return a method's parameters, their values (K,), its latency [s], and more for the row."""
+    rng = np.random.default_rng(seed)
+    if method == "nominal":
+        return work.space, work.space.nominal, 0.0, {}
+    if method in ("one-page", "mujoco-sysid"):
+        # Whole recordings, as far as they are fitted: its windows must not end where ours were cut.
+        problem = Problem(work.robot, work.space, joined(work.episodes), threads=1)
+        if method == "one-page":
+            theta, latency_s = one_page.fit(problem, robot.fitted_s)
+            return work.space, theta, latency_s, {}
+        if work.robot.setups:
+            raise ConfigurationError("mujoco.sysid has one model for all recordings")
+        found = with_delay(robot.fitted_s).run(problem, Budget(generations=SYSID_ITERATIONS), rng)
+        return work.space, found.estimate, found.latency_s, {}
+    result: CalibrationResult = calibrate_episodes(
+        work.robot,
+        work.space,
+        work.episodes,
+        work.holdout,
+        method=usual_method(config, work),
+        budget=Budget(),
+        rng=rng,
+        threads=1,
+        heldout_window_s=robot.window_s,
+        laws=method == "default",
+        guessed=work.guessed,
+    )
+    facts = {name: result.provenance.get(name) for name in ("law", "explanations")}
+    return (
+        result.space,
+        result.estimate,
+        result.latency_s,
+        {
+            **facts,
+            "method_name": result.method,
+            "colour": trust(result).colour,
+            "alarms": [str(alarm) for alarm in result.alarms],
+            "steps": result.steps,
+        },
+    )
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return errors by robot and method, as a share of the signal's range and over those without laws."""
+    lines = []
+    for robot in dict.fromkeys(row["robot"] for row in rows):
+        mine = {row["method"]: row for row in rows if row["robot"] == robot and not row["error"]}
+        shares = [f"{100 * mine[m]['share']:.3f}" if m in mine else "" for m in METHODS]
+        ratio, law = "", ""
+        if {"default", "no-laws"} <= set(mine):
+            ratio = f"{mine['default']['rmse'] / mine['no-laws']['rmse']:.3f}"
+            law = str((mine["default"]["law"] or {}).get("law", ""))
+        lines.append((robot, *shares, ratio, law))
+    heads = ("robot", *(f"{method} [%]" for method in METHODS), "default / no-laws", "law")
+    return markdown(heads, lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Score robots by methods."""
+    made = parser(__doc__, table=True)
+    made.add_argument("folder", type=Path, nargs="?", help="with a folder of each robot")
+    made.add_argument("--robots", default=",".join(ROBOTS), help=f"default: {','.join(ROBOTS)}")
+    made.add_argument("--methods", default=",".join(METHODS), help=f"default: {','.join(METHODS)}")
+    made.add_argument("--seed", type=int, default=0)
+    options = made.parse_args(arguments)
+    if options.table is not None:
+        print(table(read_rows(options.table)))
+        return 0
+    if options.folder is None:
+        made.error("name the folder of the recordings, or give --table FILE")
+    robots, methods = options.robots.split(","), options.methods.split(",")
+    if unknown := [*({*robots} - {*ROBOTS}), *({*methods} - {*METHODS})]:
+        made.error(
+            f"unknown: {', '.join(unknown)}; robots: {', '.join(ROBOTS)}; methods: {', '.join(METHODS)}"
+        )
+    rows = Rows(__file__, options.out, names=("robot", "method", "seed"))
+    for name in robots:
+        for method in methods:
+            if rows.done(name, method, options.seed):
+                continue
+            row: Row = {"robot": name, "method": method, "seed": options.seed, "error": ""}
+            with noted_in(row):
+                row |= score(ROBOTS[name], options.folder, method, options.seed)
+            rows.add(row, f"{name}, {method}: {row['error'] or format(row['rmse'], '.5f')}")
+    print(table(rows.rows))
+    return int(any(row["error"] for row in rows.rows))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
