@@ -1,9 +1,9 @@
 """Least squares as one writes it in an afternoon: one page on top of a simulator.
 
-Windows of fixed length, back to back, start from smoothed reported states. SciPy's trust region minimises the
-prediction errors of all windows, each joint over the spread of its signal, from the model's own values within
-the ranges. There are no priors, no weights by noise, no robust loss, no second start, no choice among fits and
-no laws. The latency is one more value.
+Windows of fixed length, back to back, start from smoothed reported states. SciPy's trust region minimises
+the prediction errors of all windows, each joint over the spread of its signal, from the model's own values
+within the ranges. There are no priors, no weights by noise, no robust loss, no second start, no choice among
+fits and no laws. The latency is one more value.
 """
 
 from __future__ import annotations
@@ -36,7 +36,12 @@ def fit(problem: Problem, window_s: float) -> Member:
             (np.where(data.reported, error, 0.0) / spread).reshape(len(members), -1)
             for data, error in prediction_errors(problem, members, window_s)
         ]
-        return np.nan_to_num(np.concatenate(found, axis=1), nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)
+        every = np.concatenate(found, axis=1)
+        return np.asarray(np.nan_to_num(every, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED))
+
+    def error(share: FloatArray) -> FloatArray:
+        """Return the errors at one point, (R,)."""
+        return np.asarray(errors(share[None])[0])
 
     def derivatives(share: FloatArray) -> FloatArray:
         """Return the derivatives, (R, K + 1): forward, or backward at the upper end."""
@@ -46,7 +51,7 @@ def fit(problem: Problem, window_s: float) -> Member:
 
     first = np.append(space.to_scale(space.nominal), problem.first_latency_s)
     start = np.clip((first - low) / (high - low), 1e-6, 1 - 1e-6)
-    found = least_squares(lambda x: errors(x[None])[0], start, derivatives, bounds=(0.0, 1.0), max_nfev=60)
+    found = least_squares(error, start, derivatives, bounds=(0.0, 1.0), max_nfev=60)
     values = low + found.x * (high - low)
     return np.clip(space.from_scale(values[:-1]), space.low, space.high), float(values[-1])
 

@@ -5,23 +5,24 @@ r"""Predict held-out motion of real robots, with laws that the MJCF lacks and wi
 
 FOLDER has a folder of each robot, as the converters write them from the public sources that they name:
 
-    so101       convert_so101.py; fits chirp_sweep, multisine, friction_gravity and prbs_excitation, holds out
-                step_response and slow_precision. so101-other holds out two of the fitted motions instead
-    go2         convert_go2_suspended.py --parts 4 --seconds 12.92; holds out the last part. go2-first: the first
-    cartpole    convert_cartpole.py, six recordings v1_*; holds out v1_800 and v1_1700
-    double_pendulum   the CSV files of docs/results/example-double-pendulum.md; holds out 02, 04 and 06
-    bam_xl330   convert_bam.py; fits the P gains 100, 200 and 800, holds out 400
+    so101            convert_so101.py; holds out step_response and slow_precision of six motions. so101-other:
+                     chirp_sweep and friction_gravity
+    go2              convert_go2_suspended.py --parts 4 --seconds 12.92; holds out the last part. go2-first:
+                     the first one
+    cartpole         convert_cartpole.py, six recordings v1_*; holds out v1_800 and v1_1700
+    double_pendulum  the CSV files of docs/results/example-double-pendulum.md; holds out 02, 04 and 06
+    bam_xl330        convert_bam.py; fits the P gains 100, 200 and 800, holds out 400
 
 All methods get the same recordings, parameters and ranges:
 
-    nominal     the MJCF as it is
-    one-page    least squares as one writes it in an afternoon (tools/one_page.py), with the latency
-    mujoco-sysid   MuJoCo's own toolbox, with the latency as one more parameter; not for several P gains
-    no-laws     `deal-hw calibrate --no-laws`
-    default     `deal-hw calibrate`
+    nominal       the MJCF as it is
+    one-page      least squares as one writes it in an afternoon (tools/one_page.py), with the latency
+    mujoco-sysid  MuJoCo's own toolbox, with the latency as one more parameter; not for several P gains
+    no-laws       `deal-hw calibrate --no-laws`
+    default       `deal-hw calibrate`
 
-Errors are of predictions from smoothed reported states, root mean square over all windows, mean of the joints:
-in rad (cart-pole: m and rad), and as a share of the signal's range.
+Errors are of predictions from smoothed reported states, root mean square over all windows, mean of the
+joints: in rad (cart-pole: m and rad), and as a share of the signal's range.
 """
 
 from __future__ import annotations
@@ -76,6 +77,7 @@ class Robot:
 SO101_MOTIONS = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
 SO101_OTHERS = ("step_response", "slow_precision")
 SO101_SWAPPED = ("chirp_sweep", "friction_gravity")
+XL330_MOTIONS = ("sin_sin", "sin_time_square", "up_and_down")
 
 
 def so101(held_out: Sequence[str]) -> Callable[[Path, Path], FilesSettings]:
@@ -145,11 +147,10 @@ def double_pendulum(folder: Path, made: Path) -> FilesSettings:
 def bam_xl330(folder: Path, made: Path) -> FilesSettings:
     """Return the inputs of the XL330 with a weight: a set-up for each P gain."""
     del made
-    motions = ("sin_sin", "sin_time_square", "up_and_down")
     return FilesSettings(
         model=folder / "pendulum.xml",
-        data=_npz(folder, [f"kp{gain}-{motion}" for gain in (100, 200, 800) for motion in motions]),
-        holdout=_npz(folder, [f"kp400-{motion}" for motion in motions]),
+        data=_npz(folder, [f"kp{gain}-{motion}" for gain in (100, 200, 800) for motion in XL330_MOTIONS]),
+        holdout=_npz(folder, [f"kp400-{motion}" for motion in XL330_MOTIONS]),
         columns=folder / "columns.yaml",
         parameters=folder / "parameters.yaml",
         setups=folder / "setups.yaml",
