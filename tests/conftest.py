@@ -31,8 +31,8 @@ for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIG
 os.environ.setdefault("MUJOCO_GL", "disable")
 
 NICE = int(os.environ.get("DEAL_HW_TESTS_NICE", "10"))
-"""Added to the niceness of a worker that computes: tests in real time get their cores at once. Beside ten busy
-programs such a worker would get 1 % of a core, so tools/test_under_load.py sets 0."""
+"""Added to the niceness of a worker that computes: tests in real time get their cores at once. Beside ten
+busy programs such a worker would get 1 % of a core, so tools/test_under_load.py sets 0."""
 
 
 def in_real_time(item: pytest.Item) -> bool:
