@@ -238,7 +238,7 @@ def fitted(
         laws=method == "default",
         guessed=work.guessed,
     )
-    facts = {name: result.provenance.get(name) for name in ("law", "explanations")}
+    facts = {name: result.provenance.get(name) for name in ("law", "candidates")}
     return (
         result.space,
         result.estimate,

@@ -59,7 +59,7 @@ from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
     from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice
-    from deal_hw.calib.validation.cause_words import Diagnosis
+    from deal_hw.calib.validation.candidates import Diagnosed
     from deal_hw.calib.validation.checks import SplitHalf
     from deal_hw.calib.validation.explain import Allows
 
@@ -165,8 +165,9 @@ class OutputErrorFits(Fits):
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
-        from deal_hw.calib.pipeline.law_choice import LawfulChoice, screened_laws
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice, ScreenedLaws, screened_laws
         from deal_hw.calib.validation import checks
+        from deal_hw.calib.validation.candidates import ranked
         from deal_hw.calib.validation.cross_validation import Choice
         from deal_hw.calib.validation.diagnosis import diagnose
         from deal_hw.calib.validation.explain import refused
@@ -185,17 +186,18 @@ class OutputErrorFits(Fits):
         if better:
             windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
         decided = LawfulChoice(Choice("long", {}, settings.long_s, note="without folds"))
+        laws = ScreenedLaws()
         if run.settings.cross_validation:
             lengths = windows[0].recipe.seconds, settings.long_s
-            tried = screened_laws(run, problem, first, lengths) if self.tries_laws(run) else ()
-            decided = self._choose(run, problem, seed, (first, *windows), tried, search=better)
+            laws = screened_laws(run, problem, windows[0], lengths) if self.tries_laws(run) else laws
+            decided = self._choose(run, problem, seed, (first, *windows), laws.chosen, search=better)
         choice, law = decided.made, decided.law
         run.say("fit", f"{choice.chosen} on all recordings")
         if law is None:
             searched_start = searched if better else None
             members = self._members(problem, first, windows, searched_start, choice.chosen)
         else:
-            members = law.members(problem, windows[0].member, fold=False)
+            members = law.members(problem, fold=False)
             problem = law.widened(problem)
             # The local fit knows of no law.
             run = dataclasses.replace(run, problem=law.widened(run.problem), local=None)
@@ -210,7 +212,7 @@ class OutputErrorFits(Fits):
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
             chi2 = left.normal.cost / max(left.normal.count, 1)
         local = None if run.local is None else with_rows(run.local)
-        causes: tuple[Diagnosis, ...] | None = None
+        found: Diagnosed | None = None
         judged = run.problem, local
         with run.check(AFTER_FIT):
             if (local is not None or law is not None) and left is not None:
@@ -222,7 +224,7 @@ class OutputErrorFits(Fits):
                     if self.tries_laws(run):
                         # The cross-validation has judged laws already.
                         allows = refused(allows, [law.name for law in EXPLANATIONS])
-                    causes = diagnose(judged[0], judged[1], run.tried, allows)
+                    found = diagnose(judged[0], judged[1], run.tried, allows)
             split = self._split_half(run, problem, fit, recipe, known)
         known = checks.widened_by_split_half(known, split, latency_s, problem.latency_range_s)
         if settings.hold_first:
@@ -233,9 +235,13 @@ class OutputErrorFits(Fits):
         if local is not None:
             with run.check(AFTER_FIT):
                 known, facts["physics_step"] = checks.with_step(run.problem, local, known)
-        if causes is not None and judged[1] is not None:
-            known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, causes)
-        found = confounded(problem, fit.normal.hessian / known.inflation)
+        rows = decided.candidates(laws)
+        if found is not None and judged[1] is not None:
+            known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, found.causes)
+            rows += found.candidates
+        if rows:
+            facts["candidates"] = [row.to_json() for row in ranked(rows)]
+        pairs = confounded(problem, fit.normal.hessian / known.inflation)
         if law is not None:
             known = known.with_alarms(law.finding(decided, theta))
             facts["law"] = law.facts(decided, theta)
@@ -249,14 +255,14 @@ class OutputErrorFits(Fits):
             "inflation": known.inflation,
             "at_bound": names_at_bound(problem.space, theta),
             "split_half": split.to_json(),
-            "confounded": [dataclasses.asdict(pair) for pair in found],
+            "confounded": [dataclasses.asdict(pair) for pair in pairs],
         }
         if chi2 > MISMATCH_CHI2:
             seconds = settings.mismatch_s or settings.long_s
             kind = "fitted" if settings.mismatch_s else "smoothed"
             window = f" over {seconds:g} s from {kind} start states"
             known = known.with_alarms(last=[Unexplained.larger(chi2, window)])
-        words = dict.fromkeys((*known.null_directions, *(pair.words for pair in found)))
+        words = dict.fromkeys((*known.null_directions, *(pair.words for pair in pairs)))
         known = dataclasses.replace(known, null_directions=tuple(words))
         return FitOutcome(
             searched=searched,
@@ -336,7 +342,7 @@ class OutputErrorFits(Fits):
             on = copy.copy(problem)
             on.tasks = InThisProcess()
         found = on_folds(on, masks, fits, errors, "long", settings.long_s, say)
-        gained = {} if found.note else law_errors(problem, masks, laws, whole[1].member, found, errors, say)
+        gained = {} if found.note else law_errors(problem, masks, laws, found, errors, say)
         return LawfulChoice.of(dataclasses.replace(found, steps=problem.steps - before), laws, gained)
 
     def _of_fold(

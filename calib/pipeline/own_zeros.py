@@ -40,8 +40,14 @@ class OwnZeros:
 
     def said(self, found: FitOutcome) -> FitOutcome:
         """Return an outcome of the run with them as its first cause."""
-        before: list[Any] = found.facts.get("diagnosis", [])
-        return found.with_alarms(self.cause, diagnosis=[self.cause.to_json(), *before])
+        from deal_hw.calib.validation.candidates import Candidate
+
+        row = Candidate.of(OWN_ZEROS, "fit", self.cause, "taken").to_json()
+        causes: list[Any] = found.facts.get("diagnosis", [])
+        rows: list[Any] = found.facts.get("candidates", [])
+        return found.with_alarms(
+            self.cause, diagnosis=[self.cause.to_json(), *causes], candidates=[row, *rows]
+        )
 
 
 def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:

@@ -13,7 +13,6 @@ import abc
 import dataclasses
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -74,7 +73,6 @@ from deal_hw.findings import Finding
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
     from deal_hw.calib.validation.cause_words import Diagnosis
-    from deal_hw.calib.validation.explain import Explained, Tried
     from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
@@ -328,6 +326,7 @@ def conclude_fit(
     ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
     not explain the recordings, although the residual is as large as the weights say.
     """
+    from deal_hw.calib.validation.candidates import Candidate
     from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
     from deal_hw.calib.validation.random_delay import fit_delays
     from deal_hw.calib.validation.time_steps import averaged, scan_latency
@@ -364,6 +363,8 @@ def conclude_fit(
         cause = delay_cause(late, refined.latency_s)
         known = known.with_alarms(cause)
         checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
+        taken = Candidate.of("a delay of its own for each command", "likelihood", cause, "taken")
+        checked["candidates"] = [taken.to_json(), *checked.get("candidates", [])]
     facts: dict[str, Any] = {
         "restarts": restarts,
         "window_s": refined.shooting.length * problem.episodes[0].period_s,
@@ -426,6 +427,7 @@ def with_explanation(run: CalibrationRun) -> FitOutcome | None:
 
     No search follows: nothing but noise is left to explain.
     """
+    from deal_hw.calib.validation.candidates import law_candidates, ranked
     from deal_hw.calib.validation.explain import explained, rivals
 
     if run.local is None or not run.tried or not run.settings.laws:
@@ -445,17 +447,12 @@ def with_explanation(run: CalibrationRun) -> FitOutcome | None:
         do += f" Recordings like these do not tell it from {listed(names)}."
     alarm = dataclasses.replace(best.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
+    rows = law_candidates(run.tried, found, best.explanation.name, [one.explanation.name for one in others])
     return conclude_fit(wide, None, fit).with_alarms(
         alarm,
         diagnosis=[one.diagnosis.to_json() for one in (best, *others)],
-        explanations=explanation_rows(run.tried, found),
+        candidates=[row.to_json() for row in ranked(rows)],
     )
-
-
-def explanation_rows(tried: Sequence[Tried], found: Sequence[Explained]) -> list[dict[str, Any]]:
-    """Return the explanations that were tried as plain JSON values, with what each explains."""
-    by_name = {one.explanation.name: one for one in found}
-    return [one.to_json(by_name.get(one.explanation.name)) for one in tried]
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
@@ -488,7 +485,8 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     unchecked = Validation(split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
     if suspect.confirmed(found.theta, found.latency_s):
-        return found.with_alarms(suspect.alarm, shared_error=suspect.to_json())
+        rows = [suspect.candidate.to_json()]
+        return found.with_alarms(suspect.alarm, shared_error=suspect.to_json(), candidates=rows)
     run.say(BEFORE_SEARCH, suspect.withdrawn)
     return fits.best(run)
 

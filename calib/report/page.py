@@ -6,7 +6,7 @@ import base64
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.verdict import grouped, make_story, trust
 from deal_hw.calib.validation.recording_zeros import next_zeros
-from deal_hw.calibration import RESULT_FILE, CalibrationResult, std_words
+from deal_hw.calibration import RESULT_FILE, CalibrationResult, percent, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError
 from deal_hw.parameters import Parameter, ParameterDistribution
@@ -43,6 +44,7 @@ _HIDDEN = (
     "settings",
     "budget",
     "split_half",
+    "candidates",
 )
 """Provenance that the page shows elsewhere."""
 
@@ -137,6 +139,8 @@ def render(inputs: ReportInputs) -> str:
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
         strong=charts.STRONG,
         trace=charts.trace(result.trace),
+        candidates=candidate_rows(provenance.get("candidates") or ()),
+        evidence=EVIDENCE,
         compared=compared_fits(_mapping(provenance.get("cross_validation"))),
         population=[]
         if result.population is None
@@ -277,6 +281,40 @@ def compared_fits(choice: Mapping[str, Any]) -> list[ComparedFit]:
     return [
         ComparedFit(name, tuple(errors[name]), mean(name) / mean(chosen), name == chosen)
         for name in sorted(errors, key=mean)
+    ]
+
+
+JUDGED = {
+    "fit": "a fit to a part of the recordings",
+    "effect": "its effect around the fit",
+    "likelihood": "the residual's likelihood",
+    "folds": "a fit in every fold",
+}
+OUTCOMES = {
+    "taken": "in this result",
+    "named": "named",
+    "not named": "not named",
+    "chance": "no better than without it",
+}
+"""How a candidate explanation was judged, and what became of it, in words."""
+
+
+def candidate_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the table of candidate explanations, in words.
+
+    Args:
+        found: :meth:`deal_hw.calib.validation.candidates.Candidate.to_json` of each.
+    """
+    return [
+        {
+            "explanation": row["explanation"],
+            "judged": JUDGED[row["judged"]],
+            "share": "–" if (row["share"] or 0.0) <= 0 else percent(row["share"]),
+            "deviance": "–" if (row["deviance"] or 0.0) <= 0 else short(row["deviance"], 3),
+            "outcome": OUTCOMES[row["outcome"]],
+            "taken": row["outcome"] == "taken",
+        }
+        for row in found
     ]
 
 

@@ -30,6 +30,7 @@ from deal_hw.calib.fit.intervals import (
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.fit.unexplained import Unexplained
+from deal_hw.calib.validation.candidates import Diagnosed
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
 from deal_hw.calib.validation.explain import Allows, Tried
@@ -183,13 +184,14 @@ def judge(
     if settings.physics_step:
         known, facts["physics_step"] = with_step(problem, refined, known)
     asked = settings.diagnosis and unexplained(refined)
-    causes = diagnose(problem, refined, tried, allows) if asked else ()
+    found = diagnose(problem, refined, tried, allows) if asked else Diagnosed()
     if settings.split_half:
         split = check_split_half(problem, refined, known, allows)
         known = widened_by_split_half(known, split, refined.latency_s, problem.latency_range_s)
         facts["split_half"] = split.to_json()
     if asked:
-        known, facts["diagnosis"] = with_causes(problem, refined, known, causes)
+        known, facts["diagnosis"] = with_causes(problem, refined, known, found.causes)
+        facts["candidates"] = [one.to_json() for one in found.candidates]
     return known, facts
 
 

@@ -18,6 +18,13 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.solver import kurtosis
+from deal_hw.calib.validation.candidates import (
+    Candidate,
+    Diagnosed,
+    effect_candidates,
+    law_candidates,
+    ranked,
+)
 from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, advice, stretch_words
 from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
 from deal_hw.calib.validation.explain import (
@@ -102,8 +109,8 @@ def diagnose(
     refined: Refined,
     tried: Sequence[Tried] = (),
     allows: Allows = all_allowed,
-) -> tuple[Diagnosis, ...]:
-    """Return the causes of a fit's residual, best supported first; the fit has linearised residuals.
+) -> Diagnosed:
+    """Return the causes of a fit's residual, and all candidates; the fit has linearised residuals.
 
     Args:
         problem: The problem.
@@ -113,19 +120,27 @@ def diagnose(
     """
     known = functools.cache(lambda: evidence(problem, refined))
     tried = try_explanations(problem, refined, allows, tried, known)
-    wider = [one.diagnosis for one in explained(problem, refined, tried)]
+    laws = explained(problem, refined, tried)
+    wider, zeros = [one.diagnosis for one in laws], list[Diagnosis]()
+    rows = list[Candidate]()
     if not any(one.share >= DECISIVE for one in wider):
         more = [] if problem.noise_free else zero_parameters(problem)
         if more and allows(ZEROS, wider_cost(problem, True)):
-            wider += find_zero(problem, refined, more)
-    decisive = [one for one in wider if one.share >= DECISIVE]
-    if decisive:
-        return tuple(decisive)
-    wider = [one for one in wider if supported(one.share, refined.chi2)]
-    named = {one.code for one in wider}
-    found = [one for one in name_causes(known(), refined.chi2) if one.code not in named]
-    found = [one for one in found if one.code != "mass" or weighs(problem, refined, one, allows)]
-    return tuple(sorted((*found, *wider), key=lambda f: -f.deviance))
+            zeros = find_zero(problem, refined, more)
+            if not zeros:
+                rows.append(Candidate(explanation=ZEROS, judged="fit", outcome="chance"))
+    wider += zeros
+    found, effects = [one for one in wider if one.share >= DECISIVE], list[Diagnosis]()
+    if not found:
+        wider = [one for one in wider if supported(one.share, refined.chi2)]
+        named = {one.code for one in wider}
+        effects = [one for one in name_causes(known(), refined.chi2) if one.code not in named]
+        effects = [one for one in effects if one.code != "mass" or weighs(problem, refined, one, allows)]
+        found = sorted((*effects, *wider), key=lambda f: -f.deviance)
+        rows += effect_candidates(known(), effects)
+    rows += [Candidate.of(ZEROS, "fit", one, "named" if one in found else "not named") for one in zeros]
+    rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
+    return Diagnosed(tuple(found), ranked(rows))
 
 
 def weighs(problem: Problem, refined: Refined, cause: Diagnosis, allows: Allows) -> bool:

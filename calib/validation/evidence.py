@@ -66,6 +66,7 @@ class Evidence:
     time_s: Sequence[FloatArray] = ()
     names: Sequence[str] = ()
     searched: SearchedKinds = field(default_factory=SearchedKinds)
+    _costs: dict[tuple[int, ...], float] = field(init=False, repr=False, default_factory=dict)
 
     @property
     def recordings(self) -> list[str]:
@@ -139,6 +140,12 @@ class Evidence:
 
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
+        key = tuple(map(id, taken))
+        if key not in self._costs:
+            self._costs[key] = self._held_out(taken)
+        return self._costs[key]
+
+    def _held_out(self, taken: Sequence[Signature]) -> float:
         matrix, vector, squares, prior = self._normal(taken)
         # So that no fold leaves out a whole recording, which may have a zero of its own.
         fold = fold_numbers(len(squares), FOLDS, max(ROUNDS, len(self.recordings)))

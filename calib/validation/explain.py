@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -71,18 +70,6 @@ class Tried:
     of: Problem
     screened: float
     wider: WiderFit | None
-
-    def to_json(self, found: Explained | None) -> dict[str, Any]:
-        """Return plain JSON values, with what it explains, if anything."""
-        row: dict[str, Any] = {"explanation": self.explanation.name, "screened": self.screened}
-        if self.wider is not None:
-            names = (p.name for p in self.wider.more)
-            row["values"] = dict(zip(names, map(float, self.wider.found), strict=True))
-            row["held_out_chi2"] = self.wider.prediction.chi2
-        if found is not None:
-            row |= {"held_out_before": found.before, "share": found.diagnosis.share}
-            row["deviance"] = found.diagnosis.deviance
-        return row
 
 
 @dataclass(frozen=True, slots=True)

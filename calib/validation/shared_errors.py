@@ -21,6 +21,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem, measurements, samples_in
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
+from deal_hw.calib.validation.candidates import Candidate
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
@@ -172,6 +173,18 @@ class FoundError:
             f"motion that was not fitted is predicted with chi2 {self.chi2:.3g} {before}.",
             "The parameters would compensate for this error. Comparing the two channels does not show it.",
             f"{' Or: '.join(error.do for error in self.errors)} Check it at the robot.",
+        )
+
+    @property
+    def candidate(self) -> Candidate:
+        """It as a candidate explanation that an alarm names."""
+        finite = np.isfinite(self.before) and np.isfinite(self.deviance)
+        return Candidate(
+            explanation=", or ".join(error.words for error in self.errors),
+            judged="fit",
+            outcome="named",
+            deviance=self.deviance if finite else None,
+            share=1 - self.chi2 / self.before if finite else None,
         )
 
     @property

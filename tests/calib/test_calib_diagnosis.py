@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.knee_evidence import PERIOD_S, SAMPLES, STD, WINDOWS, knee_evidence, knee_motion, moved_by
 from fakes.plain_truth import problem_of, truth
 
 from deal_hw.calib.data.parts import part_of
@@ -38,75 +39,9 @@ from deal_hw.calib.validation.wider_models import fit_wider, zero_parameters
 from deal_hw.testing.plain_robots import make_robot
 from deal_hw.types import FloatArray
 
-WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4
-DAMPING = 2.0
-"""Of the joint that this is about: its velocity decays with 1 / DAMPING seconds [1/s]."""
-
-
-def _motion() -> tuple[FloatArray, FloatArray]:
-    """Return velocity and acceleration of a joint that stirs, (W, H) [rad/s, rad/s^2]."""
-    t = (np.arange(WINDOWS * SAMPLES, dtype=np.float64) * PERIOD_S).reshape(WINDOWS, SAMPLES)
-    velocity, acceleration = np.zeros_like(t), np.zeros_like(t)
-    for f, a, phase in ((0.9, 0.4, 0.0), (2.3, 0.3, 1.0), (4.1, 0.1, 2.0)):
-        w = 2 * np.pi * f
-        velocity += a * np.sin(w * t + phase)
-        acceleration += a * w * np.cos(w * t + phase)
-    return velocity, acceleration
-
-
-def _moved_by(force: FloatArray) -> FloatArray:
-    """Integrate x'' = -DAMPING x' + force in small steps from rest in each window, (W, H)."""
-    fine = 20
-    x, v = np.zeros(WINDOWS), np.zeros(WINDOWS)
-    out = np.zeros((WINDOWS, SAMPLES))
-    for h in range(SAMPLES):
-        for _ in range(fine):
-            v += (force[:, h] - DAMPING * v) * PERIOD_S / fine
-            x += v * PERIOD_S / fine
-        out[:, h] = x
-    return out
-
-
-def _signatures() -> list[Signature]:
-    """Return what forces of size 1 do, and an offset of 1 mrad with the direction of motion."""
-    v, a = _motion()
-    made: dict[Cause, FloatArray] = {
-        "friction": _moved_by(-np.sign(v) * np.exp(-np.abs(v) / 0.1)),
-        "damping": _moved_by(-v),
-        "inertia": _moved_by(a),
-        "load": _moved_by(np.ones_like(v)),
-        "backlash": 1e-3 * np.sign(v),
-    }
-    return [Signature(cause, "knee", (x[..., None] / STD,)) for cause, x in made.items()]
-
-
-def _evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Evidence:
-    """Return white noise plus what is wrong, (W, H) [rad]; ``columns`` are what free parameters do."""
-    rng = np.random.default_rng(0)
-    time = np.arange(1, SAMPLES + 1) * PERIOD_S
-    kick = np.broadcast_to((1 - np.exp(-DAMPING * time)) / DAMPING / STD, (WINDOWS, SAMPLES))
-    start = np.stack([np.full((WINDOWS, SAMPLES), 1 / STD), kick], axis=-1)
-    known = np.broadcast_to(np.diag([1 / STD, 1 / 30.0]), (WINDOWS, 2, 2))
-    residual = rng.normal(size=(WINDOWS, SAMPLES)) + wrong / STD
-    parameter = np.stack([c / STD for c in (*columns, rng.normal(size=(WINDOWS, SAMPLES)))], axis=-1)
-    rows = WindowRows(
-        np.concatenate([residual, rng.normal(size=(WINDOWS, 2))], axis=1),
-        np.concatenate([parameter, np.zeros((WINDOWS, 2, parameter.shape[2]))], axis=1),
-        np.concatenate([start, known], axis=1),
-    )
-    return Evidence(
-        rows=[rows],
-        prior=np.full(parameter.shape[2], 1e-6),
-        found=_signatures(),
-        answers=(),
-        period_s=PERIOD_S,
-        time_s=[(np.arange(WINDOWS * SAMPLES, dtype=np.float64) * PERIOD_S).reshape(WINDOWS, SAMPLES)],
-        names=["rec.csv"],
-    )
-
 
 def _named(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> list[Diagnosis]:
-    return name_causes(_evidence(wrong, columns))
+    return name_causes(knee_evidence(wrong, columns))
 
 
 def test_noise_looks_like_nothing() -> None:
@@ -116,15 +51,15 @@ def test_noise_looks_like_nothing() -> None:
 
 def test_friction_at_low_speed() -> None:
     """A force against the motion that dies out with speed."""
-    v, _ = _motion()
-    found = _named(_moved_by(-1.0 * np.sign(v) * np.exp(-np.abs(v) / 0.1)))
+    v, _ = knee_motion()
+    found = _named(moved_by(-1.0 * np.sign(v) * np.exp(-np.abs(v) / 0.1)))
     assert found[0].code == "friction" and found[0].subject == ("knee",)
     assert found[0].share > 0.5 and "dof_friction_creep" in found[0].do
 
 
 def test_sensor_on_the_motors_side_of_the_play() -> None:
     """0.4 mrad of play: an offset with the direction of motion."""
-    v, _ = _motion()
+    v, _ = knee_motion()
     found = _named(2e-4 * np.sign(v))
     assert found[0].code == "backlash" and "the gear of knee" in found[0].do
     assert found[0].share > 0.5
@@ -132,8 +67,8 @@ def test_sensor_on_the_motors_side_of_the_play() -> None:
 
 def test_damping_that_no_parameter_has() -> None:
     """A force in proportion to velocity, and none left once a parameter does that."""
-    v, _ = _motion()
-    wrong = _moved_by(-0.3 * v)
+    v, _ = knee_motion()
+    wrong = moved_by(-0.3 * v)
     found = _named(wrong)
     assert found[0].code == "damping" and found[0].share > 0.8
     assert _named(wrong, (wrong,)) == []
@@ -144,30 +79,30 @@ def test_damping_that_no_parameter_has() -> None:
 )
 def test_forces_of_size_and_acceleration(cause: Cause, force: Callable[[FloatArray], FloatArray]) -> None:
     """A constant force is a load, one in proportion to acceleration an inertia."""
-    found = _named(_moved_by(force(_motion()[1])))
+    found = _named(moved_by(force(knee_motion()[1])))
     assert found[0].code == cause and found[0].share > 0.8
     assert len(found) == 1
 
 
 def test_two_causes_are_named_and_the_larger_first() -> None:
     """A load of 0.3 and a damping of a third of its effect."""
-    v, _ = _motion()
-    found = _named(_moved_by(np.full_like(v, 0.3)) + _moved_by(-0.1 * v))
+    v, _ = knee_motion()
+    found = _named(moved_by(np.full_like(v, 0.3)) + moved_by(-0.1 * v))
     assert [f.code for f in found] == ["load", "damping"]
     assert found[0].deviance > found[1].deviance > EVIDENCE
 
 
 def _with_masses(wrong: FloatArray, **effect: FloatArray) -> Evidence:
     """Return evidence with bodies whose mass has these effects on the prediction, (W, H) of twice it."""
-    known = _evidence(wrong)
+    known = knee_evidence(wrong)
     bodies = [Signature("mass", name, (x[..., None] / STD,)) for name, x in effect.items()]
     return dataclasses.replace(known, found=[*(s for s in known.found if s.cause != "inertia"), *bodies])
 
 
 def test_no_mass_below_zero_is_named() -> None:
     """A residual as of a cart 1.6 times heavier is also that of a pole 1.6 times lighter: impossible."""
-    v, _ = _motion()
-    effect = _moved_by(v * np.abs(v) + 0.3)
+    v, _ = knee_motion()
+    effect = moved_by(v * np.abs(v) + 0.3)
     found = name_causes(_with_masses(-1.6 * effect, cart=effect, pole=-effect))
     assert found[0].code == "mass" and found[0].subject == ("cart",)
     assert "cart 160 % heavier" in found[0].seen and "pole" not in found[0].seen
@@ -176,10 +111,10 @@ def test_no_mass_below_zero_is_named() -> None:
 
 def test_a_rotor_is_named_beside_the_mass_that_moves_alike() -> None:
     """A force with acceleration at a slide is as much a heavier cart: both stand in one alarm."""
-    _, a = _motion()
-    effect = _moved_by(0.05 * a)
+    _, a = knee_motion()
+    effect = moved_by(0.05 * a)
     known = _with_masses(effect, cart=-effect)
-    rotor = Signature("inertia", "slide", ((effect + _moved_by(0.002 + 0 * a))[..., None] / STD,))
+    rotor = Signature("inertia", "slide", ((effect + moved_by(0.002 + 0 * a))[..., None] / STD,))
     (found,) = name_causes(dataclasses.replace(known, found=[*known.found, rotor]))[:1]
     assert found.code == "mass" and "cart 100 % heavier" in found.seen
     assert "another inertia at slide explains as much" in found.seen
@@ -188,8 +123,8 @@ def test_a_rotor_is_named_beside_the_mass_that_moves_alike() -> None:
 
 def test_advice_frees_only_what_is_not_free() -> None:
     """Damping that is searched follows another law; at its bound the range is too narrow."""
-    v, _ = _motion()
-    known = _evidence(_moved_by(-0.3 * v))
+    v, _ = knee_motion()
+    known = knee_evidence(moved_by(-0.3 * v))
     free = frozenset({("dof_damping", "knee"), ("servo_damping", "knee")})
     searched = dataclasses.replace(known, searched=SearchedKinds(free))
     assert "searched already" in name_causes(searched)[0].do
@@ -202,9 +137,9 @@ def test_advice_frees_only_what_is_not_free() -> None:
 
 def test_a_value_that_compensates_for_a_cause_is_marked(small_problem: Callable[..., Problem]) -> None:
     """What takes part of a load moves once the load is named: that widens its interval, and marks it."""
-    v, _ = _motion()
-    load = _moved_by(np.full_like(v, 0.3))
-    (found,) = _named(load + _moved_by(-0.1 * v), (0.5 * load + _moved_by(0.2 * v),))[:1]
+    v, _ = knee_motion()
+    load = moved_by(np.full_like(v, 0.3))
+    (found,) = _named(load + moved_by(-0.1 * v), (0.5 * load + moved_by(0.2 * v),))[:1]
     assert abs(found.shift[0]) > 0.1
     problem = small_problem()
     fit = with_rows(refine(problem, problem.space.nominal, 0.0, (0.2,), iterations=2))
@@ -229,7 +164,7 @@ def test_contact_comes_in_bursts() -> None:
     assert "contact" in found
     assert "rec.csv 0.98 to 1.07 s, rec.csv 3.18 to 3.28 s" in found["contact"].do
     # Far above the noise they are a part of what the model lacks.
-    assert not [f for f in name_causes(_evidence(wrong), 1000.0) if f.code == "contact"]
+    assert not [f for f in name_causes(knee_evidence(wrong), 1000.0) if f.code == "contact"]
 
 
 def test_a_joint_without_a_drive_has_no_gear(small_problem: Callable[..., Problem]) -> None:
@@ -242,30 +177,30 @@ def test_a_joint_without_a_drive_has_no_gear(small_problem: Callable[..., Proble
 
 def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:
     """A load beside four times its square that no cause explains: named near the noise, not far above it."""
-    load = _moved_by(np.full((WINDOWS, SAMPLES), 0.3))
+    load = moved_by(np.full((WINDOWS, SAMPLES), 0.3))
     strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
-    known = _evidence(load + 2 * np.std(load) / np.std(strange) * strange)
+    known = knee_evidence(load + 2 * np.std(load) / np.std(strange) * strange)
     assert [f.code for f in name_causes(known, 5.0)] == ["load"]
     assert name_causes(known, 100.0) == []
     # What explains most of it stands, however large it is.
-    assert [f.code for f in name_causes(_evidence(load), 100.0)] == ["load"]
+    assert [f.code for f in name_causes(knee_evidence(load), 100.0)] == ["load"]
 
 
 def test_play_alone_stands_in_a_poor_fit() -> None:
     """It acts where the measured motion turns round, wherever the parameters are; a mass there is a guess."""
-    known = _evidence(np.zeros((WINDOWS, SAMPLES)))
+    known = knee_evidence(np.zeros((WINDOWS, SAMPLES)))
     (play,) = [s for s in known.found if s.cause == "backlash"]
     effect = play.columns[0][..., 0]
     effect = effect * 20 * STD / np.std(effect)
     strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
     strange *= np.std(effect) / np.std(strange)
-    (found,) = name_causes(_evidence(effect + 0.8 * strange), 100.0)
+    (found,) = name_causes(knee_evidence(effect + 0.8 * strange), 100.0)
     assert found.code == "backlash" and 0.3 < found.share < 0.5
     # With another cause near to it nothing is named, nor where it explains little.
-    load = _moved_by(np.full((WINDOWS, SAMPLES), 1.0))
+    load = moved_by(np.full((WINDOWS, SAMPLES), 1.0))
     near = 0.7 * load * np.std(effect) / np.std(load)
-    assert name_causes(_evidence(effect + near + 1.5 * strange), 100.0) == []
-    assert name_causes(_evidence(effect + 1.6 * strange), 100.0) == []
+    assert name_causes(knee_evidence(effect + near + 1.5 * strange), 100.0) == []
+    assert name_causes(knee_evidence(effect + 1.6 * strange), 100.0) == []
 
 
 def test_a_residual_without_a_cause_is_placed(small_problem: Callable[..., Problem]) -> None:
@@ -315,12 +250,12 @@ def _with_gaps(known: Evidence, share: float) -> Evidence:
 
 def test_lost_samples_are_no_quiet_ones_between_bursts() -> None:
     """White noise in a third of the samples, the others lost, touches nothing."""
-    assert name_causes(_with_gaps(_evidence(np.zeros((WINDOWS, SAMPLES))), 0.7)) == []
+    assert name_causes(_with_gaps(knee_evidence(np.zeros((WINDOWS, SAMPLES))), 0.7)) == []
 
 
 def test_lost_samples_are_no_evidence() -> None:
     """With 40 % of the samples lost, a load gains about 60 % of the deviance of all samples."""
-    known = _evidence(_moved_by(np.full((WINDOWS, SAMPLES), 0.3)))
+    known = knee_evidence(moved_by(np.full((WINDOWS, SAMPLES), 0.3)))
     whole, part = (name_causes(k)[0] for k in (known, _with_gaps(known, 0.4)))
     assert part.code == whole.code == "load"
     assert part.deviance == pytest.approx(0.6 * whole.deviance, rel=0.15)

@@ -112,7 +112,7 @@ def test_friction_at_rest_is_found_as_a_law() -> None:
     # Three times the friction in motion is missing; its fall with speed has another shape.
     value = best.theta[best.problem.space.names.index("pivot.friction_stribeck")]
     assert value == pytest.approx(3 * robot.truth["pivot.frictionloss"], rel=0.5)
-    causes = diagnose(problem, fit, tried)
+    causes = diagnose(problem, fit, tried).causes
     assert causes[0].code == "friction" and "dof_friction_stribeck" in causes[0].do
 
 
@@ -171,7 +171,7 @@ def test_without_laws_a_law_is_only_named() -> None:
 
 def test_a_law_must_predict_every_fold() -> None:
     """A mean that one fold makes is no evidence; a law that wins each fold is taken."""
-    law = LawCandidate(PLAY_LAW, (), (0.4, 2.0))
+    law = LawCandidate(PLAY_LAW, (), (0.4, 2.0), (np.zeros(0), 0.0))
     short, long = law.names
     plain = Choice("long", {"short": (3.0, 1.9), "long": (2.0, 2.0)}, 2.0)
     mixed = LawfulChoice.of(plain, [law], {short: [2.5], long: [1.0, 1.95]})
@@ -188,7 +188,7 @@ def test_a_law_that_loses_a_fold_is_fitted_to_no_other(
 ) -> None:
     """The short fit loses at once, and the long one in the second fold, so there is no third."""
     problem = small_problem()
-    law, folds = LawCandidate(PLAY_LAW, (), (0.4, 2.0)), list[tuple[int, str]]()
+    law, folds = LawCandidate(PLAY_LAW, (), (0.4, 2.0), (np.zeros(0), 0.0)), list[tuple[int, str]]()
     masks = [[np.arange(len(e.sample)) % 3 == k for e in problem.episodes] for k in range(3)]
     start = problem.space.nominal, 0.0
     monkeypatch.setattr(LawCandidate, "members", lambda *_, **__: dict.fromkeys(law.names, start))
@@ -198,7 +198,7 @@ def test_a_law_that_loses_a_fold_is_fitted_to_no_other(
     def errors(*_: Any) -> Any:
         return np.array(next(judged))
 
-    found = law_errors(problem, masks, [law], start, plain, errors, lambda *now: folds.append(now))
+    found = law_errors(problem, masks, [law], plain, errors, lambda *now: folds.append(now))
     assert found == {law.names[0]: [2.5], law.names[1]: [1.0, 2.5]} and folds == [
         (0, PLAY_LAW.name),
         (1, PLAY_LAW.name),

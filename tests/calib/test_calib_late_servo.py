@@ -61,7 +61,7 @@ def test_a_servo_whose_damping_acts_late_is_named() -> None:
     problem = problem_of(truth, late=10)
     theta = np.array([truth.parameters[name] for name in problem.space.names])
     fit = with_rows(refine(problem, theta, truth.latency_s))
-    found = diagnose(problem, fit)
+    found = diagnose(problem, fit).causes
     assert found[0].code == "lag" and found[0].subject == ("cart",) and found[0].share > 0.5
     assert "speed of cart" in found[0].do
     assert [s.where for s in signatures(problem, fit) if s.cause == "lag"] == ["cart"]

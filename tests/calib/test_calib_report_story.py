@@ -114,6 +114,52 @@ def test_percent_has_two_digits() -> None:
     assert [percent(v) for v in (0.0012345, 0.5, 2.34)] == ["0.12\u00a0%", "50\u00a0%", "234\u00a0%"]
 
 
+def test_candidate_explanations_stand_with_what_they_gain_and_what_became_of_them() -> None:
+    """A law in the result, a named mass, and one that predicts no better, whose loss is no figure."""
+    rows = [
+        {
+            "explanation": "friction that grows <with> load",
+            "judged": "folds",
+            "outcome": "taken",
+            "deviance": 48.07,
+            "share": 0.551,
+            "values": {},
+        },
+        {
+            "explanation": "another mass of arm",
+            "judged": "effect",
+            "outcome": "named",
+            "deviance": 31.0,
+            "share": None,
+            "values": {},
+        },
+        {
+            "explanation": "play in the gears",
+            "judged": "fit",
+            "outcome": "chance",
+            "deviance": -2.6,
+            "share": -0.04,
+            "values": {},
+        },
+    ]
+    heldout = {"nominal": 0.1, "calibrated": 0.02}
+    page = render(ReportInputs(robot="arm", result=result(heldout, provenance={"candidates": rows})))
+    table = page.split("What could explain the rest")[1].split("</table>")[0]
+    cells = [re.findall(r"<td[^>]*>(?:<span[^>]*>)?([^<]*)<", row) for row in table.split("<tr>")[2:]]
+    assert cells == [
+        [
+            "friction that grows &lt;with&gt; load",
+            "a fit in every fold",
+            "55 %",
+            "48.1",
+            "in this result",
+        ],
+        ["another mass of arm", "its effect around the fit", "–", "31", "named"],
+        ["play in the gears", "a fit to a part of the recordings", "–", "–", "no better than without it"],
+    ]
+    assert "What could explain" not in render(ReportInputs(robot="arm", result=result(heldout)))
+
+
 def test_the_compared_fits_stand_best_first_with_their_errors() -> None:
     """By hand: 3 and 12 have the geometric mean 6, twice that of 3 and 3; without folds there is no table."""
     choice = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import score_real
@@ -45,7 +46,7 @@ def test_a_missing_recording_is_named_with_the_way_to_make_it(tmp_path: Path) ->
 
 def test_the_table_compares_the_default_with_and_without_laws() -> None:
     """A ratio below 1 is a gain; a method with an error has an empty cell."""
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"robot": "so101", "method": "no-laws", "error": "", "share": 0.02, "rmse": 0.004},
         {
             "robot": "so101",
