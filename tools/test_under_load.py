@@ -43,7 +43,8 @@ def run_tests(arguments: Sequence[str], workers: int) -> tuple[int, str]:
     done = subprocess.run(
         command,
         # Tests that compute give way to those in real time, and to every loop: they would take hours.
-        env={**os.environ, "OMP_NUM_THREADS": "1", "DEAL_HW_TESTS_NICE": "0"},
+        # The summary cuts reasons at the width of the terminal.
+        env={**os.environ, "OMP_NUM_THREADS": "1", "DEAL_HW_TESTS_NICE": "0", "COLUMNS": "1000"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -73,6 +74,8 @@ def main() -> int:
         bad += code != 0
         last = output.strip().splitlines()[-1:]
         print(f"run {number + 1}: exit code {code}: {''.join(last)}", flush=True)
+        for reason in re.findall(r"^(?:FAILED|ERROR) .+$", output, re.MULTILINE):
+            print(f"  {reason}", flush=True)
         if code and not failures(output):
             print(output[-3000:], flush=True)
     for name, count in failed.most_common():

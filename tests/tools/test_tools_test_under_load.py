@@ -42,6 +42,7 @@ def test_every_run_is_beside_the_loops_and_failures_are_counted(
     assert test_under_load.main() == 1
     reported = capsys.readouterr().out
     assert reported.count("exit code 1: 1 failed, 1 passed") == 2
+    assert reported.count("  FAILED test_it.py::test_bad - assert 1 == 2") == 2
     assert "failed in 2 of 2: test_it.py::test_bad" in reported
     left = [p.cmdline() for p in psutil.Process().children()]
     assert [sys.executable, "-c", test_under_load.BUSY] not in left

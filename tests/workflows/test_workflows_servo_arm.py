@@ -63,7 +63,7 @@ def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Pa
     """The dataset holds the robot, by which calibrate finds its kind; the replay needs only the recording."""
     run = tmp_path / "run"
     report = deal_hw.collect(str(robot), port=port, out=run, motion="chirp", seconds=2.0)
-    assert report.outcome is Outcome.FINISHED
+    assert report.outcome is Outcome.FINISHED, report
     assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 150
     dataset = run / "dataset"
     kept = (dataset / "robot" / "robot.yaml").read_text(encoding="utf-8")
@@ -71,7 +71,7 @@ def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Pa
     assert json.loads((dataset / "dataset.json").read_text())["description"]["name"] == "two joints"
     assert carries_robot(dataset)
     again = deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again")
-    assert again.outcome is Outcome.FINISHED
+    assert again.outcome is Outcome.FINISHED, again
     difference = again.episodes[0].replay
     assert difference is not None and difference.position.max() < 0.05
 
@@ -79,7 +79,7 @@ def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Pa
 def test_random_set_points_need_no_policy(robot: Path, port: str, tmp_path: Path) -> None:
     """An arm stands without one; a policy that nobody named is asked for."""
     report = deal_hw.collect(str(robot), port=port, out=tmp_path / "rich", seconds=2.0, attempts=1)
-    assert report.outcome is Outcome.FINISHED
+    assert report.outcome is Outcome.FINISHED, report
     with pytest.raises(PolicyError, match="needs a policy"):
         deal_hw.deploy(str(robot), port=port, out=tmp_path / "deployed")
 
