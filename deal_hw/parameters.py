@@ -98,6 +98,50 @@ class Parameter:
             setup=setup,
         )
 
+    @classmethod
+    def from_zero(
+        cls, name: str, kind: str, elements: Iterable[str], unit: str, nominal: float, most: float
+    ) -> Parameter:
+        """Return a parameter on a linear scale that may be nil, searched from 0 to ``most``."""
+        return cls(
+            name=name,
+            kind=kind,
+            elements=tuple(elements),
+            unit=unit,
+            nominal=nominal,
+            low=0.0,
+            high=most,
+            scale="linear",
+        )
+
+    @classmethod
+    def friction_at_rest(cls, group: str, elements: Iterable[str], friction: float) -> list[Parameter]:
+        """Return friction of rotary joints that falls with speed: its excess at rest, and the Stribeck speed.
+
+        The excess begins at 0.3 of the dry friction in motion, ``friction`` [N·m], and may be five times
+        that. The speed is searched from 0.01 to 1 rad/s: a faster one cannot be told from less damping.
+        """
+        joints = tuple(elements)
+        return [
+            cls.from_zero(
+                f"{group}.friction_stribeck",
+                "dof_friction_stribeck",
+                joints,
+                "N·m",
+                0.3 * friction,
+                5 * friction,
+            ),
+            cls.around(f"{group}.stribeck_speed", "dof_stribeck_speed", joints, "rad/s", 0.1, ratio=10.0),
+        ]
+
+    @classmethod
+    def friction_by_load(cls, group: str, elements: Iterable[str]) -> Parameter:
+        """Return friction of joints that grows with the torque through the gear.
+
+        It begins at 0.02 of it and may be half of it. Identified servos have up to 0.31 (BAM, bam/params).
+        """
+        return cls.from_zero(f"{group}.friction_load", "dof_friction_load", elements, "-", 0.02, 0.5)
+
     def __post_init__(self) -> None:
         if self.scale not in get_args(Scale):
             raise UnknownNameError(f"scale of parameter {self.name!r}", self.scale, get_args(Scale))

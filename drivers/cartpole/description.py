@@ -104,6 +104,22 @@ def k9_space() -> ParameterSpace:
     return parameter_space().with_known({"pole.length": POLE_LENGTH_M, "pole.mass": POLE_MASS_KG})
 
 
+def laws_space() -> ParameterSpace:
+    """Return K9 and dry friction of the cart that falls with speed, 11 searched.
+
+    The excess at rest is searched up to five times the friction in motion; the speed at which it has fallen
+    to 1/e from 2 to 200 mm/s.
+    """
+    friction, cart = CART_FRICTIONLOSS_N, ("cart",)
+    laws = [
+        Parameter.from_zero(
+            "cart.friction_stribeck", "dof_friction_stribeck", cart, "N", 0.3 * friction, 5 * friction
+        ),
+        Parameter.around("cart.stribeck_speed", "dof_stribeck_speed", cart, "m/s", 0.02, ratio=10.0),
+    ]
+    return ParameterSpace([*k9_space().parameters, *laws])
+
+
 PAPER = {
     "pole.length": 0.3,
     "pole.mass": 0.1,
@@ -134,5 +150,5 @@ def paper_space() -> ParameterSpace:
     )
 
 
-SPACES = {"k9": k9_space, "k11": parameter_space, "paper": paper_space}
+SPACES = {"k9": k9_space, "k11": parameter_space, "laws": laws_space, "paper": paper_space}
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

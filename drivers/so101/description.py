@@ -133,6 +133,25 @@ def unbiased_space() -> ParameterSpace:
     return ParameterSpace(_rows())
 
 
+def laws_space() -> ParameterSpace:
+    """Return the 24 parameters without biases, and laws of friction by speed and by load, 42 in all.
+
+    Friction by load takes the place of dry friction, so that may fall to a hundredth.
+    """
+    known = [
+        dataclasses.replace(p, low=p.nominal / 100) if p.kind == "dof_frictionloss" else p for p in _rows()
+    ]
+    laws = [
+        law
+        for joint in JOINTS
+        for law in (
+            *Parameter.friction_at_rest(joint, (joint,), FRICTIONLOSS_NM),
+            Parameter.friction_by_load(joint, (joint,)),
+        )
+    ]
+    return ParameterSpace([*known, *laws])
+
+
 def biased_space() -> ParameterSpace:
     """Return 30 parameters, with the encoder bias of each joint, also where no recording shows it."""
     return ParameterSpace([*_rows(), *_biases(JOINTS, ENCODER_BIAS_RAD)])
@@ -147,5 +166,10 @@ def _biases(joints: Iterable[str], most: float) -> list[Parameter]:
     return [Parameter.encoder_bias(joint, most) for joint in joints]
 
 
-SPACES: Final = {"default": parameter_space, "unbiased": unbiased_space, "biased": biased_space}
+SPACES: Final = {
+    "default": parameter_space,
+    "unbiased": unbiased_space,
+    "biased": biased_space,
+    "laws": laws_space,
+}
 """Parameter sets by name; the first is the default of ``deal-hw calibrate``."""

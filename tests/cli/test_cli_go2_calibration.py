@@ -121,7 +121,7 @@ def test_held_out_motion_is_predicted_four_times_better(calibrated: CalibrateRep
 def test_parameter_sets_of_the_suspended_robot() -> None:
     """Gains, friction and armature of each joint; encoder biases, shared values, knee friction on request."""
     counts = {name: len(make()) for name, make in parameter_spaces("go2_on_stand").items()}
-    assert counts == {"default": 48, "biased": 60, "shared": 12, "linkage": 56}
+    assert counts == {"default": 48, "biased": 60, "shared": 12, "linkage": 56, "laws": 21}
 
 
 def leg_distance(joints: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

@@ -38,6 +38,7 @@ SIZES = {
     ("humanoid", "paper"): 92,
     ("cartpole", "k9"): 9,
     ("cartpole", "k11"): 11,
+    ("cartpole", "laws"): 11,
     ("cartpole", "paper"): 11,
     ("b2", "default"): 24,
     ("b2", "walk"): 29,
@@ -57,13 +58,16 @@ SIZES = {
     ("go2_on_stand", "biased"): 60,
     ("go2_on_stand", "shared"): 12,
     ("go2_on_stand", "linkage"): 56,
+    ("go2_on_stand", "laws"): 21,
     ("go2_suspended", "default"): 48,
     ("go2_suspended", "biased"): 60,
     ("go2_suspended", "shared"): 12,
     ("go2_suspended", "linkage"): 56,
+    ("go2_suspended", "laws"): 21,
     ("so101", "biased"): 30,
     ("so101", "default"): 27,
     ("so101", "unbiased"): 24,
+    ("so101", "laws"): 42,
 }
 
 

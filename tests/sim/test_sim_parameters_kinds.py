@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from fakes.law_robots import SERVO
 from mujoco.batch import Batch
 
 from deal_hw.errors import ConfigurationError, UnknownNameError
@@ -25,6 +26,7 @@ from deal_hw.sim.parameters.fields import BatchFields, ModelFields
 from deal_hw.sim.parameters.geom import bounce, damping_ratio, restitution_of
 from deal_hw.sim.parameters.laws import FRICTION_KINDS, SERVO_LAW_KINDS
 from deal_hw.sim.parameters.transmission import TRANSMISSION_KINDS
+from deal_hw.sim.parameters.yaml_space import parse_space
 
 MJCF = """
 <mujoco>
@@ -423,6 +425,16 @@ def test_every_kind_has_its_row_in_the_docs() -> None:
         wanted = [kind.element, kind.unit, "see below" if name == "body_scale" else fields, kind.along]
         assert rows[name] == wanted
     assert all(f"`{field}`" in text for field in KIND_TABLE["body_scale"].writes)
+
+
+def test_the_set_of_a_dynamixel_servo_in_the_docs_can_be_searched() -> None:
+    """Six parameters of each of two servos are searched, and the counts of its encoder are known."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "parameters.md"
+    block = page.read_text(encoding="utf-8").split("A Dynamixel X servo")[1].split("    parameters:\n")[1]
+    entries = [line[4:] for line in block.splitlines() if line.startswith("      - ")]
+    space = parse_space("\n".join(["parameters:", *entries]), mujoco.MjModel.from_xml_string(SERVO))
+    assert len(space.parameters) == 2 * 7 and len(space.free) == 2 * 6
+    assert [p.nominal for p in space.parameters if p.kind == "servo_resolution"] == 2 * [0.001534]
 
 
 def test_gain_of_a_motor_is_its_force_at_the_joint(model: mujoco.MjModel) -> None:
