@@ -238,7 +238,8 @@ class OutputErrorFits(Fits):
         rows = decided.candidates(laws)
         if found is not None and judged[1] is not None:
             known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, found.causes)
-            rows += found.candidates
+            # The cross-validation has judged laws already.
+            rows += [row for row in found.candidates if row.explanation not in laws.shares]
         if rows:
             facts["candidates"] = [row.to_json() for row in ranked(rows)]
         pairs = confounded(problem, fit.normal.hessian / known.inflation)

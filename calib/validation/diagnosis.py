@@ -353,6 +353,9 @@ def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | N
     found = random_delay(known.without(taken), known.answers, known.period_s)
     if found is None or not (found.gain > EVIDENCE and found.share > NOTICED):
         return None
+    if found.std_s > known.most_delay_std_s:
+        # Something else is large where commands change fast, such as friction by load.
+        return None
     seen = (
         f"{percent(found.share)} of the squared residual comes where commands change fast, as if each "
         f"had its own delay (standard deviation about {1e3 * found.std_s:.2g} ms): delay."

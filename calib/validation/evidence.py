@@ -56,6 +56,8 @@ class Evidence:
         time_s: Time of each sample in its recording, per episode (W, H) [s].
         names: Names of the recordings, per episode.
         searched: What the fit searched.
+        most_delay_std_s: Largest standard deviation of delays [s]: half of the longest one, as for every
+            quantity between 0 and that (Popoviciu's inequality).
     """
 
     rows: Sequence[WindowRows]
@@ -66,6 +68,7 @@ class Evidence:
     time_s: Sequence[FloatArray] = ()
     names: Sequence[str] = ()
     searched: SearchedKinds = field(default_factory=SearchedKinds)
+    most_delay_std_s: float = np.inf
     _costs: dict[tuple[int, ...], float] = field(init=False, repr=False, default_factory=dict)
 
     @property
@@ -196,6 +199,7 @@ def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Ev
         ],
         names=names,
         searched=SearchedKinds.of(problem, refined.theta),
+        most_delay_std_s=problem.latency_range_s[1] / 2,
     )
 
 

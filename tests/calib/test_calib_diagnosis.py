@@ -353,13 +353,20 @@ def test_a_right_model_has_no_cause() -> None:
 
 @pytest.mark.slow
 def test_faults_of_a_simulated_robot_are_named() -> None:
-    """Stribeck friction, and commands that are late by up to twice the mean delay."""
+    """Stribeck friction, and commands that are late by up to twice the mean delay.
+
+    If no delay may be so long, delays are not the cause.
+    """
     _, problem, fit = truth("pendulum", "friction")
     friction = name_causes(evidence(problem, fit))
     assert friction[0].code == "friction" and friction[0].subject == ("pivot",)
     _, problem, fit = truth("pendulum", "jitter")
-    jitter = name_causes(evidence(problem, fit))
+    known = evidence(problem, fit)
+    assert known.most_delay_std_s == problem.latency_range_s[1] / 2
+    jitter = name_causes(known)
     assert jitter[0].code == "delay" and "its own delay" in jitter[0].seen
+    short = dataclasses.replace(known, most_delay_std_s=1e-4)
+    assert "delay" not in [one.code for one in name_causes(short)]
 
 
 def test_a_link_crosses_its_play_as_a_free_body() -> None:
