@@ -16,9 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from plug_in import installed
 
+from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
 pytestmark = pytest.mark.real_time
@@ -82,6 +84,34 @@ def test_its_recording_is_calibrated(recorded: Recorded) -> None:
     found = {name: entry["estimate"] for name, entry in result["parameters"].items()}
     assert found["cart.damping"] == pytest.approx(recorded.truth["friction"], rel=0.05)
     assert found["cart.mass"] == pytest.approx(recorded.truth["cart_kg"], rel=0.1)
+
+
+@pytest.mark.slow
+def test_its_policy_swings_the_pole_up(installed: Path, tmp_path: Path) -> None:
+    """The control process runs the shipped policy on the emulator; the motor's output is off at the end."""
+    with EmulatorProcess(ROBOT, "--seed", "1", "--reveal") as emulator:
+        deal_hw("deploy", ROBOT, "--port", emulator.port, "--seconds", 12, "--out", tmp_path)
+        output, _ = emulator.stop()
+    report = json.loads(output.splitlines()[-1])
+    # This firmware is "enabled" from the command that switches its output on to the one that switches it off.
+    assert report["state_length"] > 31
+    modes = [what for _, _, what in report["changes"]]
+    assert "enabled" in modes and "armed" in modes
+    assert report["last_mode"] == "idle"
+    run = read_trajectory(tmp_path / "dataset" / "episodes" / "000000.mcap")
+    last = run.device_s > run.device_s[-1] - 2.0
+    assert np.cos(run.position[last, 1]).min() > np.cos(0.3)
+
+
+@pytest.mark.slow
+def test_a_policy_of_its_task_is_trained(installed: Path, tmp_path: Path) -> None:
+    """The verb finds the task of the package; a few steps give a file that may run on the robot."""
+    path = tmp_path / "short.onnx"
+    trained = ["--udr", "--trainer", "ppo", "--steps", 48, "--members", 2, "--out", path]
+    assert f"next: deal-hw deploy {ROBOT} " in deal_hw("train", ROBOT, *trained)
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["robot"] == ROBOT and record["task"]["end_position_m"] == 0.18
+    deal_hw("policy", "check", path, "--robot", ROBOT)
 
 
 @pytest.mark.slow

@@ -25,11 +25,9 @@ from deal_hw.types import Status
 class Bench:
     """An emulated device, its driver, and the wire between them, in virtual time."""
 
-    def __init__(
-        self, wrap: Callable[[Transport], Transport] = lambda link: link, length: int = 31, **truth: Any
-    ) -> None:
+    def __init__(self, wrap: Callable[[Transport], Transport] = lambda link: link, **truth: Any) -> None:
         self.clock = VirtualClock()
-        self.device = Device(Truth(**truth), length)
+        self.device = Device(Truth(**truth))
         self.wire = VirtualTransport(self.device, self.clock)
         self.robot = BenchCartpole(wrap(self.wire), self.clock)
 
@@ -63,7 +61,7 @@ class TestBenchCartpole(RobotSuite):
 @pytest.mark.parametrize("length", [31, 36, 40])
 def test_every_firmware_is_driven(length: int) -> None:
     """Later firmware needs a switch before it obeys, and earlier firmware does not know it."""
-    bench = Bench(length=length)
+    bench = Bench(state_length=length)
     robot = bench.armed()
     start = bench.device.position[0]
     robot.send_command(default_command(robot, target=0.5))

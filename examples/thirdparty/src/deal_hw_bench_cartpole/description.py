@@ -17,6 +17,7 @@ COUNTS_RAD: Final = 4271.34 / (2 * math.pi)
 """Counts of the pole's potentiometer a radian."""
 CART_KG: Final = 0.230
 POLE_KG: Final = 0.087
+POLE_M: Final = 0.395
 CART_FRICTION_NS_M: Final = 3.22
 POLE_FRICTION_NMS: Final = 5e-5
 FORCE_N: Final = 1.77

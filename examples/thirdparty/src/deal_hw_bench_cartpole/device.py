@@ -26,6 +26,8 @@ TURN: Final = 2 * np.pi * COUNTS_RAD
 """Counts of a full turn, where the potentiometer begins again at 0."""
 NEAR_END: Final = 20
 """A command towards an end of the track has no effect within these counts of it."""
+FIRMWARES: Final = (31, 36, 40)
+"""Lengths of a state's frame, which name the firmware's layout [bytes]."""
 CALIBRATION_MS: Final = 1510
 """No multiple of the control period, so that its end lies between two states."""
 
@@ -42,6 +44,7 @@ class Truth:
         start_rad: Angle of the pole from hanging at power-on.
         noise: Whether the encoders are noisy.
         seed: Of the noise.
+        state_length: Length of its states' frames [bytes]: 31 for firmware of 2024, 36 and 40 for later ones.
     """
 
     cart_kg: float = CART_KG
@@ -51,10 +54,11 @@ class Truth:
     start_rad: float = 0.0
     noise: bool = False
     seed: int = 0
+    state_length: int = 31
 
 
 def draw_truth(profile: str, seed: int, range_ratio: float) -> Truth:
-    """Return a truth: mass and friction within a factor of their usual values."""
+    """Return a truth: mass and friction within a factor of their usual values, firmware by turns."""
     rng = np.random.default_rng(seed)
     cart, friction = range_ratio ** rng.uniform(-1.0, 1.0, 2)
     return Truth(
@@ -65,6 +69,7 @@ def draw_truth(profile: str, seed: int, range_ratio: float) -> Truth:
         start_rad=float(rng.uniform(-0.05, 0.05)),
         noise=profile != "ideal",
         seed=seed,
+        state_length=FIRMWARES[seed % len(FIRMWARES)],
     )
 
 
@@ -73,15 +78,13 @@ class Device:
 
     Attributes:
         received_bytes: Number of bytes from the host.
-        state_length: Length of its states' frames: 31 for firmware of 2024, 36 and 40 for later ones.
 
     Args:
-        truth: The mechanics.
-        state_length: See the attribute.
+        truth: The mechanics, and the layout of the firmware.
     """
 
-    def __init__(self, truth: Truth, state_length: int = 31) -> None:
-        self.received_bytes, self.state_length = 0, state_length
+    def __init__(self, truth: Truth) -> None:
+        self.received_bytes = 0
         self._truth = truth
         self._rng = np.random.default_rng(truth.seed)
         self._model = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
@@ -111,8 +114,10 @@ class Device:
 
     @property
     def mode(self) -> str:
-        """State of the motor."""
-        return "homing" if self._calibrating else "armed" if self._motor else "idle"
+        """State of the motor. Later firmware is "enabled" while its output is on without a command."""
+        if self._calibrating:
+            return "homing"
+        return "armed" if self._motor else "enabled" if self._enabled else "idle"
 
     @property
     def watchdog(self) -> bool:
@@ -166,11 +171,11 @@ class Device:
             self._calibrating, self._next_motor = CALIBRATION_MS, 0
         elif command == Command.CONFIGURE:
             self._period = max(1, struct.unpack_from("<H", payload)[0])
-        elif command == Command.PC_CONTROL and self.state_length > 31:
+        elif command == Command.PC_CONTROL and self._truth.state_length > 31:
             self._enabled, self._next_motor = bool(payload[0]), 0
         elif command == Command.MOTOR and not self._calibrating:
             (counts,) = struct.unpack("<i", payload)
-            allowed = self._enabled or self.state_length == 31
+            allowed = self._enabled or self._truth.state_length == 31
             self._next_motor = counts if allowed else 0
         return b""
 
@@ -191,7 +196,7 @@ class Device:
             position=round((x - self._origin_m + noise[0]) * COUNTS_M),
             motor=self._motor,
             time_us=self._tick * 1000,
-            length=self.state_length,
+            length=self._truth.state_length,
         )
 
     def _force(self) -> float:

@@ -24,6 +24,8 @@ ROBOT: Final = RobotEntry(
         WireEntry(name="tcp", transport="tcp"),
     ),
     spaces="deal_hw_bench_cartpole.description:SPACES",
+    task="deal_hw_bench_cartpole.swing_up:SWING_UP",
+    policy="deal_hw_bench_cartpole:assets/swing_up.onnx",
 )
 
 TCP: Final = TransportEntry(
