@@ -3,9 +3,9 @@
 A law of `deal_hw.sim` (friction by speed or load, the effort by speed, a servo's firmware, an elastic
 transmission) writes the model's fields before each step. A row is one robot, law and number of members:
 `ratio` is the processor time of a rollout with the law on all joints over that of one without, in one thread.
-They run in turns, and the median of the turns' ratios counts, with its quartiles, so other work on the machine
-changes little. Robots begin in their default pose, under random set-points, which change every ten steps. A law
-that changes the motion changes the time of contacts and friction, too, so a ratio below 1 can be.
+They run in turns, and the median of the turns' ratios counts, with its quartiles, so that other work
+changes little. Robots begin in their default pose, under random set-points, which change every ten steps. A
+law that changes the motion changes the time of contacts and friction, too, so a ratio below 1 can be.
 
 .venv/bin/python tools/measure_laws.py --out laws.json
 .venv/bin/python tools/measure_laws.py --robots so101 --laws transmission --members 16 --steps 400
