@@ -19,7 +19,7 @@ from deal_hw.sim.engine.closed_loop import ClosedLoop
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.transmission import Transmissions, take_constant_torques
 from deal_hw.sim.engine.warp_support import choose_engine
-from deal_hw.sim.laws.transmission import TransmissionLaw
+from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
 from deal_hw.sim.parameters import check_space
 from deal_hw.sim.parameters.fields import ModelFields
 from deal_hw.types import FloatArray
@@ -93,9 +93,17 @@ def law(**parts: float) -> TransmissionLaw:
 
 
 def coupled(of: TransmissionLaw, *state: float) -> list[float]:
-    """Return torque, inertia, own speed and the share that follows, of one joint."""
-    found = of.couple(*(np.array([[value]]) for value in state))
-    parts = found.torque, found.inertia, found.own_speed, found.follows
+    """Return torque, inertia, own speed and the share that follows, of one joint.
+
+    Args:
+        of: Its law.
+        state: Deflection, speeds of the motor and of the link, torque, and what it loses with the speed.
+    """
+    *now, resistance = (np.array([[value]]) for value in state)
+    couplings = Couplings(of, resistance)
+    torque, _ = couplings.couple(*now)
+    own_speed, moving = (couplings.motor_speed(np.full((1, 1), speed)) for speed in (0.0, 1.0))
+    parts = torque, couplings.inertia, own_speed, moving - own_speed
     return [float(part[0, 0]) for part in parts]
 
 
@@ -106,13 +114,25 @@ def test_a_soft_spring_by_hand() -> None:
 
 
 def test_a_damper_by_hand() -> None:
-    """0.5 N·m·s/rad: the rotor, 0.02 kg·m² in 1 ms, is 20 N·m·s/rad, so 0.5/20.5 of the link's speed adds."""
+    """0.5 N·m·s/rad, half of it at the end: the rotor, 0.02 kg·m² in 1 ms, is 20, so 0.25/20.25 follow."""
     torque, inertia, speed, follows = coupled(law(damping=0.5), 0.03, 1.0, 0.5, 2.0, 0.0)
-    assert follows == pytest.approx(0.5 / 20.5)
-    assert speed == pytest.approx((20.0 + 2.0 - 3.0) / 20.5)
-    # The damper passes 0.5 times the difference of speeds at the end, with the link's as it is.
-    assert torque == pytest.approx(3.0 + 0.5 * (speed + follows * 0.5 - 0.5))
-    assert inertia == pytest.approx(0.001 * 0.5 * 20 / 20.5)
+    assert follows == pytest.approx(0.25 / 20.25)
+    # The spring's 3 N·m and half of the damper's 0.5 (1 - 0.5) N·m are those at the beginning.
+    push = 3.0 + 0.25 * (1.0 - 0.5)
+    assert speed == pytest.approx((20.0 + 2.0 - push) / 20.25)
+    assert torque == pytest.approx(push + 0.25 * (speed + follows * 0.5 - 0.5))
+    assert inertia == pytest.approx(0.001 * 0.25 * 20 / 20.25)
+
+
+def test_a_motors_resistance_by_hand() -> None:
+    """4 N·m·s/rad, half of it at the end: 22 w' = 18 w + 2 N·m less the spring's 3 N·m."""
+    speed = (18.0 * 1.0 + 2.0 - 3.0) / 22.0
+    assert coupled(law(), 0.03, 1.0, 0.5, 2.0, 4.0) == pytest.approx([3.0, 0.0, speed, 0.0])
+
+
+def test_a_strong_damper_does_not_ring() -> None:
+    """200 N·m·s/rad on a rotor of 20: a tenth counts at the beginning, and it stops in one step."""
+    assert coupled(law(), 0.0, 1.0, 0.0, 0.0, 200.0) == pytest.approx([0.0, 0.0, 0.0, 0.0])
 
 
 def test_a_stiff_spring_adds_the_rotor_to_the_link() -> None:

@@ -244,16 +244,18 @@ def rollout(
     nu = ctrl.shape[1]
     pushed = bool(spec & int(mujoco.mjtState.mjSTATE_QFRC_APPLIED))
     ctrl[:] = control[:, 0, :nu]
-    laws.begin(batch.forward)
-    for step in range(steps):
-        ctrl[:] = control[:, step, :nu]
-        laws.write()
-        if pushed:
-            applied[:] = control[:, step, nu:]
-        batch.step()
-        laws.follow()
-        for name, field in fields.items():
-            record[name][:, step] = field
+    # A member that diverged has no numbers, and is found by the engine.
+    with np.errstate(over="ignore", invalid="ignore"):
+        laws.begin(batch.forward)
+        for step in range(steps):
+            ctrl[:] = control[:, step, :nu]
+            laws.write()
+            if pushed:
+                applied[:] = control[:, step, nu:]
+            batch.step()
+            laws.follow()
+            for name, field in fields.items():
+                record[name][:, step] = field
     return record
 
 

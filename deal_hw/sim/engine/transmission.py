@@ -20,7 +20,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.servo_firmware import ServoFirmware
 from deal_hw.sim.laws.motor import effort_range
-from deal_hw.sim.laws.transmission import Coupling, TransmissionLaw
+from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
 from deal_hw.sim.parameters.laws import FREE_SPEED
 from deal_hw.sim.parameters.transmission import (
@@ -120,6 +120,7 @@ class Transmissions:
         )
         self._gear = np.array(model.actuator_gear[actuator, 0])
         self._limited = np.array(model.actuator_forcelimited[actuator], dtype=bool)
+        self._any_limited = bool(self._limited.any())
         self._control_range = np.where(
             model.actuator_ctrllimited[actuator], model.actuator_ctrlrange[actuator].T, [[-np.inf], [np.inf]]
         )
@@ -130,10 +131,10 @@ class Transmissions:
             self._free_speed = np.stack([known.get(name, never) for name in names], axis=1)
         self._bounded = bool(np.isfinite(self._control_range).any())
         self.angle, self.speed = np.zeros(shape), np.zeros(shape)
-        # What is in the fields of a transmission: the torque before the gear, and the inertia that is felt.
-        self._passed, self._felt = np.zeros(shape), rotor
+        # The torque that the transmissions pass.
+        self._passed = np.zeros(shape)
         self.fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
-        self._coupling: Coupling | None = None
+        self._moves = False
         self.read_sent()
 
     @classmethod
@@ -152,9 +153,10 @@ class Transmissions:
         gain, bias, limits = self._own
         ends = np.sort(self._gear[:, None] * limits, axis=-1)
         ends[:, ~self._limited] = -np.inf, np.inf
-        self._least, self._most = ends[..., 0], ends[..., 1]
+        self._least, self._most = (np.ascontiguousarray(ends[..., k]) for k in (0, 1))
         self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
         self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
+        self._couplings = Couplings(self.law, self._resistance)
         self._write_motors(np.zeros(len(self.fresh), dtype=bool))
 
     def restore_sent(self) -> None:
@@ -175,9 +177,9 @@ class Transmissions:
         gain, bias, limits = self._own
         self._gain[:, at, 0] = np.where(there, gain, 0.0)
         self._bias[:, at, :3] = np.where(there[..., None], bias, 0.0)
-        self._bias[:, at, 0] = np.where(there, bias[..., 0], self._passed)
+        self._bias[:, at, 0] = np.where(there, bias[..., 0], self._passed / self._gear)
         self._range[:, at] = np.where(there[..., None], limits, (-np.inf, np.inf))
-        self._put_inertia(np.where(there, self.law.inertia, self._felt))
+        self._put_inertia(np.where(there, self.law.inertia, self._couplings.inertia))
 
     def _put_inertia(self, inertia: FloatArray) -> None:
         """Write what the links have beside their own inertia, (N, B)."""
@@ -200,7 +202,7 @@ class Transmissions:
             firmware.write()
             # Members that go on pass the torque of their last step.
             sent = self._bias[:, self._actuator, 0]
-            self._bias[:, self._actuator, 0] = np.where(rows[:, None], sent, self._passed)
+            self._bias[:, self._actuator, 0] = np.where(rows[:, None], sent, self._passed / self._gear)
         forward()
         link = self._qvel[:, self._dof]
         passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
@@ -218,23 +220,29 @@ class Transmissions:
         if served:
             efforts = self._bias[:, [self.actuator[k] for k in served], 0]
             self._constant[:, served] = self._gear[served] * efforts
-        link, link_speed = self._qpos[:, self._place], self._qvel[:, self._dof]
-        control, resistance = self._control[:, self._actuator], self._resistance
+        link = self._qpos[:, self._place].copy()
+        control = self._control[:, self._actuator]
         if self._bounded:
-            control = np.clip(control, *self._control_range)
-        # A member that diverged has no numbers, and is found by the engine.
-        with np.errstate(over="ignore", invalid="ignore"):
-            torque = self._per_control * control + self._constant - self._per_position * link
-            if self._limited.any():
-                acting = torque - resistance * self.speed
-                held = np.clip(acting, *self._limits())
-                able = held == acting
-                torque, resistance = np.where(able, torque, held), np.where(able, resistance, 0.0)
-            coupling = self.law.couple(self.angle - link, self.speed, link_speed, torque, resistance)
-        self._passed, self._felt = coupling.torque / self._gear, coupling.inertia
-        self._bias[:, self._actuator, 0] = self._passed
-        self._put_inertia(self._felt)
-        self._coupling = coupling
+            low, high = self._control_range
+            control = np.minimum(np.maximum(control, low), high)
+        torque = self._per_control * control + self._constant - self._per_position * link
+        beyond = None
+        if self._any_limited:
+            least, most = self._limits()
+            acting = torque - self._resistance * self.speed
+            able = np.minimum(np.maximum(acting, least), most)
+            beyond = able != acting
+            if np.count_nonzero(beyond):
+                torque = np.where(beyond, able, torque)
+            else:
+                beyond = None
+        self._passed, changed = self._couplings.couple(
+            self.angle - link, self.speed, self._qvel[:, self._dof], torque, beyond
+        )
+        self._bias[:, self._actuator, 0] = self._passed / self._gear
+        if changed:
+            self._put_inertia(self._couplings.inertia)
+        self._moves = True
 
     def _limits(self) -> tuple[FloatArray, FloatArray]:
         """Return the least and largest torque of the motors at their speeds, (N, B) each."""
@@ -244,7 +252,6 @@ class Transmissions:
 
     def follow(self) -> None:
         """Move the rotors by the step that the engine has done."""
-        if self._coupling is not None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                self.speed = self._coupling.motor_speed(self._qvel[:, self._dof])
-                self.angle = self.angle + self.law.step_s * self.speed
+        if self._moves:
+            self.speed = self._couplings.motor_speed(self._qvel[:, self._dof])
+            self.angle = self.angle + self.law.step_s * self.speed

@@ -20,37 +20,28 @@ oscillations lose amplitude in each step. At its beginning (share 0) they keep i
 With ``a = h² k (1/J + 1/Jl)`` the share is ``max(0, 1 - 1/a)``: oscillations of less than 1 radian a step
 are damped by d alone, and any spring is stable while the link's inertia Jl is at least a fourth of the one
 given here.
+
+The speeds of c and d are a mean of those at both ends of the step. The end has the share ``1/2``, so that the
+error is of second order: at the end alone c acts as an inertia h c / 2 too much. With
+``x = h (c/J + d (1/J + 1/Jl))`` the share is ``1 - 1/x`` where that is more, so that strong dampers do not
+ring, and at least that of the spring, so that stiff ones move as the rigid model. Any share from 1/2 on is
+stable. A mode loses speed by the factor ``(1 - (1 - share) x) / (1 + share x + share' a)``, where share' is
+the spring's. The roots of a step lie within the unit circle for
+``4 + 2 (2 share - 1) x + (2 share' - 1) a > 0``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.types import FloatArray
 
-
-@dataclass(frozen=True, slots=True)
-class Coupling:
-    """What a link feels of its motor in one step, and how the motor follows the link; (N, B) each.
-
-    Attributes:
-        torque: Constant torque on the link [N·m or N].
-        inertia: Inertia that the link has beside its own [kg·m² or kg].
-        own_speed: Speed of the motor at the end of the step, if the link stands still there [rad/s or m/s].
-        follows: Share of the link's speed that adds to it [-].
-    """
-
-    torque: FloatArray
-    inertia: FloatArray
-    own_speed: FloatArray
-    follows: FloatArray
-
-    def motor_speed(self, link_speed: FloatArray) -> FloatArray:
-        """Return the motors' speeds at the end of the step from those of the links, (N, B)."""
-        return np.asarray(self.own_speed + self.follows * link_speed)
+Mask: TypeAlias = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +53,7 @@ class TransmissionLaw:
         damping: d, at least 0 [N·m·s/rad or N·s/m].
         play: b, width of the gap, at least 0 [rad or m].
         inertia: J, the rotor's, above 0 [kg·m² or kg].
-        link_inertia: Jl, about that of the link, for the share of the step [kg·m² or kg].
+        link_inertia: Jl, about that of the link, for the shares of the step [kg·m² or kg].
         step_s: h [s].
     """
 
@@ -74,29 +65,98 @@ class TransmissionLaw:
     step_s: float
 
     @cached_property
-    def _ahead_s(self) -> FloatArray:
-        """Part of the step after which the spring's angle counts, (N, B) [s]."""
-        turned = self.step_s**2 * self.stiffness * (1 / self.inertia + 1 / self.link_inertia)
-        return np.asarray(self.step_s * np.maximum(0.0, 1.0 - 1.0 / turned))
+    def _lightness(self) -> FloatArray:
+        """Acceleration of the bodies from each other a torque between them, (N, B) [1/(kg·m²)]."""
+        return np.asarray(1 / self.inertia + 1 / self.link_inertia)
 
     @cached_property
-    def _grip(self) -> FloatArray:
-        """Torque a difference of the speeds at the end of the step, (N, B) [N·m·s/rad]."""
-        return np.asarray(self.stiffness * self._ahead_s + self.damping)
+    def spring_share(self) -> FloatArray:
+        """Share of the step after which the spring's angle counts, (N, B) [-]."""
+        turned = self.step_s**2 * self.stiffness * self._lightness
+        return np.asarray(1 - 1 / np.maximum(turned, 1.0))
 
     @cached_property
-    def _carried(self) -> FloatArray:
-        """Torque that stops a rotor of 1 rad/s in one step, (N, B) [N·m·s/rad]."""
-        return self.inertia / self.step_s
+    def ahead_s(self) -> FloatArray:
+        """The time of that share, (N, B) [s]."""
+        return self.step_s * self.spring_share
 
     @cached_property
-    def _gapless(self) -> bool:
+    def half_play(self) -> FloatArray:
+        """Half of the gap's width, (N, B) [rad or m]."""
+        return self.play / 2
+
+    @cached_property
+    def gapless(self) -> bool:
         """Whether no joint has play."""
         return not np.any(self.play)
 
     def deflection(self, torque: FloatArray) -> FloatArray:
         """Return motor less link angles at which the transmissions at rest pass torques, (N, B)."""
-        return np.asarray(torque / self.stiffness + np.sign(torque) * self.play / 2)
+        return np.asarray(torque / self.stiffness + np.sign(torque) * self.half_play)
+
+    def damper_share(self, resistance: FloatArray) -> FloatArray:
+        """Return the share of the speeds at the end of the step in those of the dampers, (N, B) [-].
+
+        Args:
+            resistance: What the motor's torque loses with its speed, c, (N, B) [N·m·s/rad or N·s/m].
+        """
+        lost = self.step_s * (resistance / self.inertia + self.damping * self._lightness)
+        least = np.maximum(0.5, self.spring_share)
+        return np.asarray(np.maximum(least, 1 - 1 / np.maximum(lost, 1.0)))
+
+    def factors(self, resistance: FloatArray, *, closed: bool) -> FloatArray:
+        """Return what a step multiplies by where the gaps are closed, or where they are open, (12, N, B).
+
+        Args:
+            resistance: What the motor's torque loses with its speed, c, (N, B) [N·m·s/rad or N·s/m].
+            closed: Whether the gaps are closed.
+
+        Returns:
+            Factors of deflection, motor's speed, link's speed and motor's torque in the motor's speed at the
+            end, if the link stands still there, and the same four in the torque on the link. Then the share
+            of the link's speed at the end that adds to the motor's, and the inertia that the link has beside
+            its own. Last those of the motor's speed and torque in the speed at the end of a free rotor.
+        """
+        end = self.damper_share(resistance)
+        carried, none = self.inertia / self.step_s, np.zeros_like(resistance)
+        rotor, kept = carried + end * resistance, carried - (1 - end) * resistance
+        spring, damper = (self.stiffness, (1 - end) * self.damping) if closed else (none, none)
+        grip = spring * self.ahead_s + (end * self.damping if closed else none)
+        both = rotor + grip
+        follows, left = grip / both, rotor / both
+        # The part of grip that the rotor's speed does not follow.
+        felt = grip * left
+        own = -spring / both, (kept - damper) / both, damper / both, 1 / both
+        torque = spring * left, damper * left + follows * kept, -damper * left - felt, follows
+        return np.stack([*own, *torque, follows, self.step_s * felt, kept / rotor, 1 / rotor])
+
+
+class Couplings:
+    """What links feel of their motors in each step, and how the motors follow them.
+
+    A joint is in one of four cases: its gap is closed or open, and its motor has a torque that falls with its
+    speed or one at its limit. The factors of all cases are computed once; those that act change with them.
+
+    Args:
+        law: The transmissions.
+        resistance: What the motors' torques lose with their speeds, c, (N, B) [N·m·s/rad or N·s/m].
+
+    Attributes:
+        inertia: What the links have beside their own, (N, B) [kg·m² or kg].
+    """
+
+    def __init__(self, law: TransmissionLaw, resistance: FloatArray) -> None:
+        self._law, shape = law, resistance.shape
+        # By gap (closed, open), then by motor (free, held).
+        self._table = np.array(
+            [[law.factors(c, closed=fits) for c in (resistance, 0 * resistance)] for fits in (True, False)]
+        )
+        self._nowhere: Mask = np.zeros(shape, dtype=bool)
+        self._held, self._open = self._nowhere, self._nowhere
+        # Deflection, motor's speed, link's speed and motor's torque; then their products, and their sums.
+        self._state, self._products = np.zeros((4, *shape)), np.zeros((2, 4, *shape))
+        self._sums = np.zeros((2, *shape))
+        self._act(self._table[0, 0])
 
     def couple(
         self,
@@ -104,35 +164,54 @@ class TransmissionLaw:
         motor_speed: FloatArray,
         link_speed: FloatArray,
         torque: FloatArray,
-        resistance: FloatArray,
-    ) -> Coupling:
-        """Return the coupling during the next step, (N, B) throughout.
+        held: Mask | None = None,
+    ) -> tuple[FloatArray, bool]:
+        """Return the constant torque on the links during the next step, and whether `inertia` changed.
+
+        The torque is overwritten in the next step.
 
         Args:
-            deflection: Motor less link angle [rad or m].
-            motor_speed: Speed of the motor [rad/s or m/s].
-            link_speed: Speed of the link [rad/s or m/s].
-            torque: Torque of the motor at standstill, t [N·m or N].
-            resistance: What it loses with the motor's speed, c [N·m·s/rad or N·s/m].
+            deflection: Motor less link angle, (N, B) [rad or m].
+            motor_speed: Speed of the motor, (N, B) [rad/s or m/s].
+            link_speed: Speed of the link, (N, B) [rad/s or m/s].
+            torque: Torque of the motor: at standstill, t, or the limit where it is held, (N, B) [N·m or N].
+            held: Where the motor is at its limit, (N, B); None for nowhere.
         """
-        drive = self._carried * motor_speed + torque
-        rotor = self._carried + resistance
-        if self._gapless:
-            grip, push = self._grip, self.stiffness * deflection
-        else:
+        held, opened = self._nowhere if held is None else held, self._nowhere
+        changed = held is not self._held and bool(np.count_nonzero(held != self._held))
+        if not self._law.gapless:
             # Whether the gap is closed is asked of a rotor that nothing holds yet.
-            reached = deflection + self._ahead_s * (drive / rotor - link_speed)
-            half = self.play / 2
-            closed = np.abs(reached) >= half
-            grip = np.where(closed, self._grip, 0.0)
-            push = np.where(closed, self.stiffness * (deflection - np.copysign(half, reached)), 0.0)
-        both = rotor + grip
-        own_speed, follows = (drive - push) / both, grip / both
-        # The part of grip that the rotor's speed does not follow.
-        felt = follows * rotor
-        return Coupling(
-            torque=push + grip * own_speed - felt * link_speed,
-            inertia=self.step_s * felt,
-            own_speed=own_speed,
-            follows=follows,
-        )
+            kept, free = self._free
+            if changed:
+                kept, free = np.where(held, self._table[0, 1, 10:], self._table[0, 0, 10:])
+            half = self._law.half_play
+            reached = deflection + self._law.ahead_s * (kept * motor_speed + free * torque - link_speed)
+            opened = np.abs(reached) < half
+            deflection = deflection - np.copysign(half, reached)
+            changed = changed or bool(np.count_nonzero(opened != self._open))
+        if changed:
+            self._held, self._open = held, opened
+            self._act(self._choose(held, opened))
+        state = self._state
+        state[0], state[1], state[2], state[3] = deflection, motor_speed, link_speed, torque
+        np.multiply(self._factors, state, out=self._products)
+        np.add.reduce(self._products, axis=1, out=self._sums)
+        return self._sums[1], changed
+
+    def motor_speed(self, link_speed: FloatArray) -> FloatArray:
+        """Return the motors' speeds at the end of the step from those of the links, (N, B)."""
+        return np.asarray(self._sums[0] + self._follows * link_speed)
+
+    def _choose(self, held: Mask, opened: Mask) -> FloatArray:
+        """Return the factors of joints whose motors are held and whose gaps are open there, (12, N, B)."""
+        closed, apart = self._table
+        if not np.count_nonzero(opened):
+            return np.asarray(np.where(held, closed[1], closed[0]))
+        if np.count_nonzero(held):
+            closed, apart = (np.where(held, rows[1], rows[0])[None] for rows in (closed, apart))
+        return np.asarray(np.where(opened, apart[0], closed[0]))
+
+    def _act(self, factors: FloatArray) -> None:
+        """Let factors act, (12, N, B)."""
+        self._factors = factors[:8].reshape(self._products.shape)
+        self._follows, self.inertia, self._free = factors[8], factors[9], factors[10:]
