@@ -41,17 +41,43 @@ def test_candidates_lie_in_the_inner_part_of_the_range() -> None:
 
 @pytest.mark.parametrize("name", SPACES)
 def test_a_truth_is_drawn_in_the_space_that_is_named(name: str) -> None:
-    """Free parameters lie in the inner part of the space's own range, known ones at their value."""
+    """Free parameters fill the inner part of the space's own range, known ones have their value."""
     space = SPACES[name]()
     rng = np.random.default_rng(0)
     truths = [
         candidate_truth("ideal", rng, seed=0, range_ratio=5.0, refused=0, space=space) for _ in range(100)
     ]
-    for p in space:
-        ratios = np.log([t.parameters[p.name] / p.nominal for t in truths])
-        assert 0.6 * np.log(5) < np.max(np.abs(ratios)) <= 0.8 * np.log(5) + 1e-12
+    ranged = space.with_ratio(5.0)
+    share = ranged.normalize(np.array([[t.parameters[p.name] for p in space] for t in truths]))
+    assert 0.1 - 1e-9 < share.min() and share.max() < 0.9 + 1e-9
+    assert share.min(axis=0).max() < 0.2 and share.max(axis=0).min() > 0.8
     for known, value in space.known.items():
         assert all(t.parameters[known] == value for t in truths)
+
+
+def test_friction_at_rest_is_a_truths_own_where_it_has_one() -> None:
+    """A force of 1.2 times the friction in motion moves the cart; not where half as much comes at rest."""
+
+    def moved(**laws: float) -> float:
+        usual = nominal_truth()
+        mechanics = Mechanics(dataclasses.replace(usual, parameters={**usual.parameters, **laws}))
+        mechanics.release()
+        start = mechanics.position[0]
+        for _ in range(200):
+            mechanics.step(1.2 * usual.parameters["cart.frictionloss"])
+        return abs(mechanics.position[0] - start)
+
+    free = moved()
+    held = moved(**{"cart.friction_stribeck": 0.5 * nominal_truth().parameters["cart.frictionloss"]})
+    assert held < 0.1 * free
+
+
+def test_laws_of_a_truth_survive_json() -> None:
+    """A truth without them has none afterwards."""
+    with_laws = draw_truth("ideal", 2, space=SPACES["laws"]())
+    assert {"cart.friction_stribeck", "cart.stribeck_speed"} < set(with_laws.parameters)
+    assert CartpoleTruth.from_json(json.loads(json.dumps(with_laws.to_json()))) == with_laws
+    assert "cart.friction_stribeck" not in draw_truth("ideal", 2).parameters
 
 
 def test_without_a_space_a_truth_is_the_one_of_k9() -> None:

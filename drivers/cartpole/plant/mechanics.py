@@ -66,7 +66,13 @@ class Mechanics:
         self._sim = build_simulation(truth.parameters)
         self._sensor = Sensor(self._profile, truth.sensing_ticks, round(read_rate_hz), sensor_rng)
         self._actuation_ticks = truth.actuation_ticks
-        self._friction_n = truth.parameters["cart.frictionloss"]
+        own = truth.parameters
+        self._friction_n = own["cart.frictionloss"]
+        # Friction that falls with speed: a truth's own, or the profile's.
+        self._stribeck_ratio = self._profile.stribeck_ratio
+        if "cart.friction_stribeck" in own:
+            self._stribeck_ratio = own["cart.friction_stribeck"] / self._friction_n
+        self._stribeck_m_s = own.get("cart.stribeck_speed", self._profile.stribeck_speed_m_s)
         self._start_angle_rad = start_angle_rad
         self._motor_m = 0.0
         self._homing_from = (0.0, 0.0)
@@ -138,9 +144,9 @@ class Mechanics:
             return False
         if self.homing:
             return self._move_home()
-        if self._profile.stribeck_ratio:
-            speed = self._now[1][_CART] / self._profile.stribeck_speed_m_s
-            excess = self._profile.stribeck_ratio * math.exp(-(speed**2))
+        if self._stribeck_ratio:
+            speed = self._now[1][_CART] / self._stribeck_m_s
+            excess = self._stribeck_ratio * math.exp(-(speed**2))
             self._sim.set_frictionloss(_CART, self._friction_n * (1.0 + excess))
         self._sim.step((force, 0.0))
         return False

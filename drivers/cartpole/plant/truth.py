@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from deal_hw.drivers.cartpole.description import k9_space, parameter_space
+from deal_hw.drivers.cartpole.description import k9_space, laws_space, parameter_space
 from deal_hw.drivers.cartpole.plant.profiles import profile as find_profile
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
@@ -27,7 +27,8 @@ class CartpoleTruth:
     Attributes:
         profile: Name of the profile.
         seed: Seed of the draw, of noise and of the start angles.
-        parameters: Every parameter by name, known ones included [SI units of ``parameter_space()``].
+        parameters: Every parameter of ``parameter_space()`` by name, known ones included [SI units], and the
+            laws of ``laws_space()`` where they were drawn; else the profile's act.
         actuation_ticks: A command acts that many device ticks after it was received, before jitter.
         sensing_ticks: A frame reports the state of that many device ticks ago, before jitter.
         refused: Draws before this one that the oracle policy could not balance.
@@ -72,9 +73,11 @@ class CartpoleTruth:
             number(found.refused, "refused", 0)
             number(found.actuation_ticks, "actuation_ticks", 0, MOST_TICKS)
             number(found.sensing_ticks, "sensing_ticks", 0, MOST_TICKS)
+            needed = {p.name for p in parameter_space().parameters}
             known = {
                 p.name: number(found.parameters[p.name], p.name, 0.1 * p.low, 10 * p.high)
-                for p in parameter_space().parameters
+                for p in laws_space().parameters
+                if p.name in found.parameters or p.name in needed
             }
             return dataclasses.replace(found, parameters=known)
 
@@ -99,7 +102,7 @@ def candidate_truth(
     refused: int,
     space: ParameterSpace | None = None,
 ) -> CartpoleTruth:
-    """Draw free parameters log-uniformly in the 10-90 % part of their range, and a latency.
+    """Draw free parameters in the 10-90 % part of their range, uniformly in their scales, and a latency.
 
     ``space`` says which parameters are free, and around which values; without it K9. Parameters that it does
     not have keep their nominal values.
