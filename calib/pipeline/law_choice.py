@@ -86,7 +86,7 @@ class LawCandidate:
     def finding(self, choice: LawfulChoice, theta: FloatArray) -> Finding:
         """Return what was found where a fit with the law was chosen, with its values, (K + L,)."""
         found = self._values(theta)
-        values = listed([f"{p.name} = {found[p.name]:.2g} {p.unit}".rstrip() for p in self.more])
+        values = listed([f"{p.name} = {found[p.name]:.2g} {p.unit}".rstrip(" -") for p in self.more])
         lower = percent(1 - float(np.exp(np.mean(np.log(choice.ratios)))))
         law = self.explanation
         return Finding.alarm(

@@ -297,6 +297,8 @@ OUTCOMES = {
     "chance": "no better than without it",
 }
 """How a candidate explanation was judged, and what became of it, in words."""
+LEAST_SHOWN, LEAST_GAIN = 1e-3, 1.0
+"""Smaller shares and gains in deviance of a candidate are shown as none [-]."""
 
 
 def candidate_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -309,8 +311,8 @@ def candidate_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         {
             "explanation": row["explanation"],
             "judged": JUDGED[row["judged"]],
-            "share": "–" if (row["share"] or 0.0) <= 0 else percent(row["share"]),
-            "deviance": "–" if (row["deviance"] or 0.0) <= 0 else short(row["deviance"], 3),
+            "share": "–" if (row["share"] or 0.0) < LEAST_SHOWN else percent(row["share"]),
+            "deviance": "–" if (row["deviance"] or 0.0) < LEAST_GAIN else short(row["deviance"], 3),
             "outcome": OUTCOMES[row["outcome"]],
             "taken": row["outcome"] == "taken",
         }

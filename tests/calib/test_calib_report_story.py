@@ -115,7 +115,7 @@ def test_percent_has_two_digits() -> None:
 
 
 def test_candidate_explanations_stand_with_what_they_gain_and_what_became_of_them() -> None:
-    """A law in the result, a named mass, and one that predicts no better, whose loss is no figure."""
+    """A law in the result, a named mass, and one that gains nothing to speak of, which is no figure."""
     rows = [
         {
             "explanation": "friction that grows <with> load",
@@ -137,8 +137,8 @@ def test_candidate_explanations_stand_with_what_they_gain_and_what_became_of_the
             "explanation": "play in the gears",
             "judged": "fit",
             "outcome": "chance",
-            "deviance": -2.6,
-            "share": -0.04,
+            "deviance": 0.03,
+            "share": 0.0004,
             "values": {},
         },
     ]
