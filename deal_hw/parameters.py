@@ -115,24 +115,30 @@ class Parameter:
         )
 
     @classmethod
-    def friction_at_rest(cls, group: str, elements: Iterable[str], friction: float) -> list[Parameter]:
-        """Return friction of rotary joints that falls with speed: its excess at rest, and the Stribeck speed.
+    def friction_at_rest(
+        cls,
+        group: str,
+        elements: Iterable[str],
+        friction: float,
+        *,
+        speed: float = 0.1,
+        units: tuple[str, str] = ("N·m", "rad/s"),
+    ) -> list[Parameter]:
+        """Return friction of joints that falls with speed: its excess at rest, and the Stribeck speed.
 
-        The excess begins at 0.3 of the dry friction in motion, ``friction`` [N·m], and may be five times
-        that. The speed is searched from 0.01 to 1 rad/s: a faster one cannot be told from less damping.
+        Args:
+            group: Name of the joints.
+            elements: The joints.
+            friction: Dry friction in motion [N·m or N]. The excess begins at 0.3 of it, and may be five times
+                that.
+            speed: Where the speed's search begins [rad/s or m/s]; it goes a factor of 10 to either side. A
+                faster one cannot be told from less damping.
+            units: Those of friction and speed.
         """
-        joints = tuple(elements)
-        return [
-            cls.from_zero(
-                f"{group}.friction_stribeck",
-                "dof_friction_stribeck",
-                joints,
-                "N·m",
-                0.3 * friction,
-                5 * friction,
-            ),
-            cls.around(f"{group}.stribeck_speed", "dof_stribeck_speed", joints, "rad/s", 0.1, ratio=10.0),
-        ]
+        joints, (of_friction, of_speed) = tuple(elements), units
+        rest = f"{group}.friction_stribeck", "dof_friction_stribeck", joints, of_friction
+        fall = f"{group}.stribeck_speed", "dof_stribeck_speed", joints, of_speed
+        return [cls.from_zero(*rest, 0.3 * friction, 5 * friction), cls.around(*fall, speed, ratio=10.0)]
 
     @classmethod
     def friction_by_load(cls, group: str, elements: Iterable[str]) -> Parameter:
@@ -295,6 +301,23 @@ class ParameterSpace:
             else p
             for p in self.parameters
         )
+
+    def with_friction_laws(
+        self, groups: Iterable[tuple[str, tuple[str, ...]]], friction: float
+    ) -> ParameterSpace:
+        """Return the space with friction by speed and by load of groups of rotary joints, each with a name.
+
+        ``friction`` is the dry friction in motion [N·m]. Friction by load takes its place, so that one of
+        this space may fall to a hundredth.
+        """
+        own = [
+            dataclasses.replace(p, low=p.nominal / 100) if p.kind == "dof_frictionloss" else p
+            for p in self.parameters
+        ]
+        for group, joints in groups:
+            own += Parameter.friction_at_rest(group, joints, friction)
+            own.append(Parameter.friction_by_load(group, joints))
+        return ParameterSpace(own)
 
     def with_known(self, values: Mapping[str, float]) -> ParameterSpace:
         """Return the space with these parameters known at these values; ranges are widened to fit."""

@@ -28,12 +28,6 @@ MOST_LAG_S = 0.1
 FIRST_LAG_S = 0.005
 """Time constant from which its fit begins [s]."""
 
-MOST_LOAD = 0.5
-"""Largest friction a torque that is tried [-]. Identified servos have up to 0.31 (BAM, bam/params)."""
-
-FIRST_LOAD = 0.02
-"""Friction a torque from which its fit begins [-]."""
-
 MOST_ASYMMETRY = 0.5
 """Largest share by which a motor does more to one side that is tried [-]."""
 
@@ -101,7 +95,7 @@ def _load(problem: Problem) -> list[Parameter]:
     if any(_searched(problem, kind) for kind in ("dof_friction_load", "dof_friction_motor")):
         return []
     driven = problem.robot.description.actuated
-    return [_parameter(problem, "dof_friction_load", name, FIRST_LOAD, 0.0, MOST_LOAD) for name in driven]
+    return [Parameter.friction_by_load(name, (name,)) for name in driven]
 
 
 def _lag(problem: Problem) -> list[Parameter]:

@@ -110,13 +110,7 @@ def laws_space() -> ParameterSpace:
     The excess at rest is searched up to five times the friction in motion; the speed at which it has fallen
     to 1/e from 2 to 200 mm/s.
     """
-    friction, cart = CART_FRICTIONLOSS_N, ("cart",)
-    laws = [
-        Parameter.from_zero(
-            "cart.friction_stribeck", "dof_friction_stribeck", cart, "N", 0.3 * friction, 5 * friction
-        ),
-        Parameter.around("cart.stribeck_speed", "dof_stribeck_speed", cart, "m/s", 0.02, ratio=10.0),
-    ]
+    laws = Parameter.friction_at_rest("cart", ("cart",), CART_FRICTIONLOSS_N, speed=0.02, units=("N", "m/s"))
     return ParameterSpace([*k9_space().parameters, *laws])
 
 

@@ -134,22 +134,8 @@ def unbiased_space() -> ParameterSpace:
 
 
 def laws_space() -> ParameterSpace:
-    """Return the 24 parameters without biases, and laws of friction by speed and by load, 42 in all.
-
-    Friction by load takes the place of dry friction, so that may fall to a hundredth.
-    """
-    known = [
-        dataclasses.replace(p, low=p.nominal / 100) if p.kind == "dof_frictionloss" else p for p in _rows()
-    ]
-    laws = [
-        law
-        for joint in JOINTS
-        for law in (
-            *Parameter.friction_at_rest(joint, (joint,), FRICTIONLOSS_NM),
-            Parameter.friction_by_load(joint, (joint,)),
-        )
-    ]
-    return ParameterSpace([*known, *laws])
+    """Return the 24 parameters without biases, and laws of friction by speed and by load, 42 in all."""
+    return unbiased_space().with_friction_laws([(joint, (joint,)) for joint in JOINTS], FRICTIONLOSS_NM)
 
 
 def biased_space() -> ParameterSpace:

@@ -73,11 +73,10 @@ class CartpoleTruth:
             number(found.refused, "refused", 0)
             number(found.actuation_ticks, "actuation_ticks", 0, MOST_TICKS)
             number(found.sensing_ticks, "sensing_ticks", 0, MOST_TICKS)
-            needed = {p.name for p in parameter_space().parameters}
+            space = laws_space() if "cart.friction_stribeck" in found.parameters else parameter_space()
             known = {
                 p.name: number(found.parameters[p.name], p.name, 0.1 * p.low, 10 * p.high)
-                for p in laws_space().parameters
-                if p.name in found.parameters or p.name in needed
+                for p in space.parameters
             }
             return dataclasses.replace(found, parameters=known)
 

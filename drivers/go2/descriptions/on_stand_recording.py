@@ -110,23 +110,8 @@ def linkage_space() -> ParameterSpace:
 
 
 def laws_space() -> ParameterSpace:
-    """Return the 12 shared parameters, and shared laws of friction by speed and by load, 21 in all.
-
-    Friction by load takes the place of dry friction, so that may fall to a hundredth.
-    """
-    known = [
-        dataclasses.replace(p, low=p.nominal / 100) if p.kind == "dof_frictionloss" else p
-        for p in shared_space()
-    ]
-    laws = [
-        law
-        for part, joints in floor.by_part()
-        for law in (
-            *Parameter.friction_at_rest(part, joints, FRICTIONLOSS_NM),
-            Parameter.friction_by_load(part, joints),
-        )
-    ]
-    return ParameterSpace([*known, *laws])
+    """Return the 12 shared parameters, and shared laws of friction by speed and by load, 21 in all."""
+    return shared_space().with_friction_laws(floor.by_part(), FRICTIONLOSS_NM)
 
 
 SPACES: Final = {
