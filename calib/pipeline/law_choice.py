@@ -26,7 +26,7 @@ from deal_hw.calib.fit.output_error import (
     prediction_errors,
     prediction_rmse,
 )
-from deal_hw.calib.fit.solver import correlated_samples
+from deal_hw.calib.fit.solver import channel_scale, correlated_samples
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun
 from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks
@@ -178,10 +178,10 @@ class LawfulChoice:
 
     def candidates(self, laws: ScreenedLaws) -> list[Candidate]:
         """Return all laws that were fitted to a part of the recordings; those of the folds by these."""
-        rows = []
+        rows, chosen = list[Candidate](), {law.explanation.name for law in laws.chosen}
         for name, share in laws.shares.items():
             judged: Judged = "fit"
-            outcome: Outcome = "not named" if name in laws.promising() else "chance"
+            outcome: Outcome = "not named" if name in chosen else "chance"
             if self.law is not None and name == self.law.explanation.name:
                 judged, outcome = "folds", "taken"
                 share = 1 - float(np.exp(2 * np.mean(np.log(self.ratios))))
@@ -256,8 +256,7 @@ def screened_laws(
     with run.check(EXPLANATIONS):
         try:
             without = fit_output_error(part, *fit.member, recipe).member
-            rms = prediction_rmse(rest, [without], seconds[0])[0]
-            count = _independent(rest, without, seconds[0], rms)
+            rms, count = _unexplained(rest, without, seconds[0])
         except InsufficientDataError:
             return ScreenedLaws()
         for law, more in can.items():
@@ -278,10 +277,11 @@ def screened_laws(
     return dataclasses.replace(found, chosen=[law for law in laws if law.explanation.name in chosen])
 
 
-def _independent(problem: Problem, member: Member, seconds: float, rms: FloatArray) -> float:
-    """Return how many independent errors the predictions of a member have, with a size of ``rms``, (M,)."""
-    errors, samples = list[FloatArray](), 0
-    for data, error in prediction_errors(problem, [member], seconds):
-        errors.append(np.where(data.reported, error[0], 0.0) / rms)
-        samples += int(np.count_nonzero(data.reported))
-    return samples / correlated_samples(errors, samples_in(problem, seconds))
+def _unexplained(problem: Problem, member: Member, seconds: float) -> tuple[FloatArray, float]:
+    """Return the size of a member's prediction errors, (M,), and how many of them are independent."""
+    found = list(prediction_errors(problem, [member], seconds))
+    seen = [data.reported for data, _ in found]
+    errors = [np.where(s, e[0], 0.0) for s, (_, e) in zip(seen, found, strict=True)]
+    rms = channel_scale(errors, seen, robust=False)
+    longest = samples_in(problem, seconds)
+    return rms, int(np.sum([s.sum() for s in seen])) / correlated_samples([e / rms for e in errors], longest)
