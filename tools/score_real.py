@@ -31,6 +31,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,11 @@ import numpy as np
 import one_page
 from measuring import Row, Rows, markdown, parser, read_rows
 
-from deal_hw.bench.first_answer import GO2_PARAMETERS, SO101_PARAMETERS
+from deal_hw.bench.first_answer import SETTINGS, go2_inputs, so101_inputs
 from deal_hw.bench.rows import noted_in
 from deal_hw.calib.baselines.sysid import with_delay
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import names_at_bound
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calibration import Budget, CalibrationResult
@@ -53,8 +55,6 @@ from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 METHODS = ("nominal", "one-page", "mujoco-sysid", "no-laws", "default")
-SYSID_ITERATIONS = 200
-"""Its own default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,50 +74,8 @@ class Robot:
     folder: str
 
 
-SO101_MOTIONS = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
-SO101_OTHERS = ("step_response", "slow_precision")
 SO101_SWAPPED = ("chirp_sweep", "friction_gravity")
 XL330_MOTIONS = ("sin_sin", "sin_time_square", "up_and_down")
-
-
-def so101(held_out: Sequence[str]) -> Callable[[Path, Path], FilesSettings]:
-    """Return the inputs of the SO-101 with these motions held out; see docs/results/example-so101.md."""
-    from deal_hw.drivers.so101.description import DESCRIPTION
-
-    def inputs(folder: Path, made: Path) -> FilesSettings:
-        (made / "so101.yaml").write_text(SO101_PARAMETERS, encoding="utf-8")
-        fitted = [name for name in (*SO101_MOTIONS, *SO101_OTHERS) if name not in held_out]
-        return FilesSettings(
-            model=DESCRIPTION.mjcf,
-            data=_npz(folder, fitted),
-            holdout=_npz(folder, held_out),
-            parameters=made / "so101.yaml",
-            columns=folder / "columns.yaml",
-            leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
-            fit_seconds=30.0,
-            physics_step=0.004,
-        )
-
-    return inputs
-
-
-def go2(held_out: int) -> Callable[[Path, Path], FilesSettings]:
-    """Return the inputs of the Go2 on its stand with a part held out, of 1 to 4."""
-    from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
-
-    def inputs(folder: Path, made: Path) -> FilesSettings:
-        (made / "go2.yaml").write_text(GO2_PARAMETERS, encoding="utf-8")
-        fitted = [f"traj_0_part{number}" for number in range(1, 5) if number != held_out]
-        return FilesSettings(
-            model=DESCRIPTION.mjcf,
-            data=_npz(folder, fitted),
-            holdout=_npz(folder, [f"traj_0_part{held_out}"]),
-            parameters=made / "go2.yaml",
-            columns=folder / "columns.yaml",
-            window=0.2,
-        )
-
-    return inputs
 
 
 def cartpole(folder: Path, made: Path) -> FilesSettings:
@@ -158,10 +116,12 @@ def bam_xl330(folder: Path, made: Path) -> FilesSettings:
 
 
 ROBOTS: Mapping[str, Robot] = {
-    "so101": Robot(so101(SO101_OTHERS), 5.0, 2.0, "so101"),
-    "so101-other": Robot(so101(SO101_SWAPPED), 5.0, 2.0, "so101"),
-    "go2": Robot(go2(4), 2.5, 2.0, "go2"),
-    "go2-first": Robot(go2(1), 2.5, 2.0, "go2"),
+    "so101": Robot(so101_inputs, 5.0, 2.0, "so101"),
+    "so101-other": Robot(
+        partial(so101_inputs, held_out=("chirp_sweep", "friction_gravity")), 5.0, 2.0, "so101"
+    ),
+    "go2": Robot(go2_inputs, 2.5, 2.0, "go2"),
+    "go2-first": Robot(partial(go2_inputs, held_out=1), 2.5, 2.0, "go2"),
     "cartpole": Robot(cartpole, 0.2, 0.2, "cartpole"),
     "double_pendulum": Robot(double_pendulum, 0.2, 0.2, "double_pendulum"),
     "bam_xl330": Robot(bam_xl330, 1.0, 1.0, "bam_xl330"),
@@ -192,7 +152,6 @@ def score(robot: Robot, folder: Path, method: str, seed: int) -> Row:
     row = {"seconds": time.monotonic() - began, "processor_seconds": time.process_time() - cpu}
     held_out = HeldOut(work.robot, work.space, work.holdout, robot.window_s, threads=1).of(space)
     errors = held_out.errors({"fit": (theta, latency_s)})
-    unit = space.normalize(theta)
     return row | {
         "parameters": len(space),
         "fitted_s": float(sum(len(e.sample) * e.period_s for e in work.episodes)),
@@ -202,7 +161,7 @@ def score(robot: Robot, folder: Path, method: str, seed: int) -> Row:
         "share": errors.nrmse["fit"],
         "by_joint": dict(zip(errors.names, map(float, errors.rmse["fit"]), strict=True)),
         "latency_s": latency_s,
-        "at_bound": [n for n, u in zip(space.names, unit, strict=True) if u < 1e-6 or u > 1 - 1e-6],
+        "at_bound": names_at_bound(space, theta),
         "estimate": dict(zip(space.names, map(float, theta), strict=True)),
         **more,
     }
@@ -223,7 +182,7 @@ def fitted(
             return work.space, theta, latency_s, {}
         if work.robot.setups:
             raise ConfigurationError("mujoco.sysid has one model for all recordings")
-        found = with_delay(robot.fitted_s).run(problem, Budget(generations=SYSID_ITERATIONS), rng)
+        found = with_delay(robot.fitted_s).run(problem, Budget(generations=SETTINGS.sysid_iterations), rng)
         return work.space, found.estimate, found.latency_s, {}
     result: CalibrationResult = calibrate_episodes(
         work.robot,

@@ -97,18 +97,15 @@ class _Ask:
     real: Path | None
     seconds: float
 
-    def recorded(self, name: str, motions: Sequence[str], example: str) -> list[Path]:
-        """Return files of a real robot.
+    def recordings(self, name: str, example: str) -> Path:
+        """Return the folder of a real robot.
 
         Raises:
-            ConfigurationError: There are none; the message says how to make them.
+            ConfigurationError: There is none; the message says how to make it.
         """
         if self.real is None:
             raise ConfigurationError(f"no real recordings: give --real DIR; {example} makes DIR/{name}")
-        files = [self.real / name / f"{motion}.npz" for motion in motions]
-        if missing := [str(f) for f in (*files, self.real / name / "columns.yaml") if not f.exists()]:
-            raise ConfigurationError(f"{', '.join(missing)} missing: {example} shows how to make them")
-        return files
+        return self.real / name
 
 
 def _written(robot: PlainRobot, ask: _Ask) -> FilesSettings:
@@ -145,41 +142,78 @@ def _stiffness(mjcf: str) -> dict[str, float]:
     return {name: float(kp) for name, kp in re.findall(r'joint="(\w+)" kp="([^"]*)"', mjcf)}
 
 
-def _so101(ask: _Ask) -> FilesSettings:
+def _recorded(folder: Path, motions: Sequence[str], example: str) -> list[Path]:
+    """Return files of a real robot.
+
+    Raises:
+        ConfigurationError: One is missing; the message says how to make them.
+    """
+    files = [folder / f"{motion}.npz" for motion in motions]
+    if missing := [str(f) for f in (*files, folder / "columns.yaml") if not f.exists()]:
+        raise ConfigurationError(f"{', '.join(missing)} missing: {example} shows how to make them")
+    return files
+
+
+SO101_EXAMPLE, GO2_EXAMPLE = page("results/example-so101.md"), page("results/example-go2-suspended.md")
+SO101_FAST = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
+SO101_SLOW = ("step_response", "slow_precision")
+"""Motions of the SO-101 that no table disturbs."""
+
+
+def so101_inputs(folder: Path, made: Path, held_out: Sequence[str] = SO101_SLOW) -> FilesSettings:
+    """Return the inputs of a calibration of the SO-101; its parameters are written into the folder ``made``.
+
+    Raises:
+        ConfigurationError: A recording is missing.
+    """
     from deal_hw.drivers.so101.description import DESCRIPTION
 
-    fitted = ("chirp_sweep", "multisine", "friction_gravity", "prbs_excitation")
-    held_out = ("step_response", "slow_precision")
-    files = ask.recorded("so101", (*fitted, *held_out), page("results/example-so101.md"))
-    parameters = ask.folder / "so101.yaml"
+    fitted = [motion for motion in (*SO101_FAST, *SO101_SLOW) if motion not in held_out]
+    files = _recorded(folder, (*fitted, *held_out), SO101_EXAMPLE)
+    parameters = made / "so101.yaml"
     parameters.write_text(SO101_PARAMETERS, encoding="utf-8")
     return FilesSettings(
         model=DESCRIPTION.mjcf,
         data=files[: len(fitted)],
         holdout=files[len(fitted) :],
         parameters=parameters,
-        columns=files[0].with_name("columns.yaml"),
+        columns=folder / "columns.yaml",
         leave_out=(("chirp_sweep.npz", 105.0, 999.0),),
         fit_seconds=30.0,
         physics_step=0.004,
     )
 
 
-def _go2(ask: _Ask) -> FilesSettings:
+def go2_inputs(folder: Path, made: Path, held_out: int = 4) -> FilesSettings:
+    """Return the inputs of a calibration of the Go2 on its stand, with a part of 1 to 4 held out.
+
+    Its parameters are written into the folder ``made``.
+
+    Raises:
+        ConfigurationError: A recording is missing.
+    """
     from deal_hw.drivers.go2.descriptions.on_stand_recording import DESCRIPTION
 
-    parts = [f"traj_0_part{number}" for number in range(1, 5)]
-    files = ask.recorded("go2", parts, page("results/example-go2-suspended.md"))
-    parameters = ask.folder / "go2.yaml"
+    files = _recorded(folder, [f"traj_0_part{number}" for number in range(1, 5)], GO2_EXAMPLE)
+    judge = files.pop(held_out - 1)
+    parameters = made / "go2.yaml"
     parameters.write_text(GO2_PARAMETERS, encoding="utf-8")
     return FilesSettings(
         model=DESCRIPTION.mjcf,
-        data=files[:3],
-        holdout=files[3],
+        data=files,
+        holdout=judge,
         parameters=parameters,
-        columns=files[0].with_name("columns.yaml"),
+        columns=folder / "columns.yaml",
         window=0.2,
     )
+
+
+def _so101(ask: _Ask) -> FilesSettings:
+    return so101_inputs(ask.recordings("so101", SO101_EXAMPLE), ask.folder)
+
+
+def _go2(ask: _Ask) -> FilesSettings:
+    return go2_inputs(ask.recordings("go2", GO2_EXAMPLE), ask.folder)
 
 
 PROBLEMS: Mapping[str, Callable[[_Ask], FilesSettings]] = {

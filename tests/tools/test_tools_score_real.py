@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import score_real
 
+from deal_hw.bench import first_answer
 from deal_hw.errors import ConfigurationError
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.settings import FilesSettings
@@ -73,8 +74,8 @@ def test_unknown_robots_and_methods_are_refused(capsys: pytest.CaptureFixture[st
 def test_no_recording_is_both_fitted_and_held_out(name: str, tmp_path: Path) -> None:
     """Each of the two splits of a robot fits what the other one judges by."""
     for stem in (
-        *score_real.SO101_MOTIONS,
-        *score_real.SO101_OTHERS,
+        *first_answer.SO101_FAST,
+        *first_answer.SO101_SLOW,
         *(f"traj_0_part{number}" for number in range(1, 5)),
         *(f"v1_{number}" for number in (0, 1, 5, 800, 1200, 1700)),
         *(f"kp{kp}-{motion}" for kp in (100, 200, 400, 800) for motion in score_real.XL330_MOTIONS),
@@ -82,10 +83,11 @@ def test_no_recording_is_both_fitted_and_held_out(name: str, tmp_path: Path) -> 
         (tmp_path / f"{stem}.npz").touch()
     for number in range(7):
         (tmp_path / f"trajectory_{number:02}.csv").touch()
+    (tmp_path / "columns.yaml").touch()
     made = tmp_path / "made"
     made.mkdir()
     config = score_real.ROBOTS[name].inputs(tmp_path, made)
-    held_out = config.holdout
+    held_out = config.holdout if isinstance(config.holdout, list | tuple) else [config.holdout]
     assert held_out
     assert not set(held_out) & set(config.data)
     assert all(path.exists() for path in (*config.data, *held_out))
