@@ -18,9 +18,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from fakes.law_robots import known
 from measuring import Rows, parser
 
-from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.parameters import ParameterSpace
 from deal_hw.robots.registry import robot_description
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel, load_model
@@ -38,14 +39,6 @@ LAWS: dict[str, dict[str, float]] = {
 """Parameters of each law: kinds and their values."""
 EVERY = 10
 """Steps between recorded states, and of a set-point."""
-
-
-def known(kind: str, element: str, value: float) -> Parameter:
-    """Return a parameter that is not searched."""
-    return Parameter(
-        name=f"{element}.{kind}", kind=kind, elements=(element,), unit="-", nominal=value, low=value - 1,
-        high=value + 1, scale="linear", known=True,
-    )  # fmt: skip
 
 
 def members_with(robot: RobotModel, law: str, count: int) -> ServoBatch:

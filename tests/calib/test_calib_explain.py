@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from fakes.law_robots import SERVO, robot
 from fakes.plain_truth import refused, truth
+from fakes.small_runs import small_run
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice, law_errors
 from deal_hw.calib.pipeline.output_error_fits import OutputErrorFits
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, with_explanation
@@ -154,12 +153,8 @@ def test_a_law_is_taken_for_what_it_predicts(fault: Fault | None, law: str | Non
 def test_without_laws_a_law_is_only_named() -> None:
     """Who wants a result that plain MuJoCo runs gets one."""
     _, problem, fit = truth("pendulum", "backlash")
-    rng = np.random.default_rng(0)
-    run = CalibrationRun(
-        problem=problem,
-        budget=Budget(population=20, generations=4),
-        rng=rng,
-        attempts=Restarts(Eki(), rng, None),
+    run = small_run(
+        problem,
         settings=Validation(laws=False),
         local=with_rows(fit),
         tried=try_explanations(problem, with_rows(fit), all_allowed),

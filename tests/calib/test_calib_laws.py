@@ -10,16 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 from _pytest.mark import ParameterSet
+from fakes.small_runs import small_run
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.output_error import Recipe, fit_output_error
 from deal_hw.calib.fit.refinement import refine
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.law_choice import screened_laws
-from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.settings import Validation
-from deal_hw.calibration import Budget
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 
@@ -230,16 +226,8 @@ def test_friction_by_load_is_chosen_where_dry_friction_has_taken_its_place(tmp_p
         )
     )
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
-    rng = np.random.default_rng(0)
-    run = CalibrationRun(
-        problem=problem,
-        budget=Budget(population=20, generations=4),
-        rng=rng,
-        attempts=Restarts(Eki(), rng, None),
-        settings=Validation(),
-    )
     fit = fit_output_error(problem, problem.space.nominal, 0.0, Recipe(seconds=0.4))
-    found = screened_laws(run, problem, fit, (0.4, 2.0))
+    found = screened_laws(small_run(problem), problem, fit, (0.4, 2.0))
     (law,) = found.chosen
     assert law.explanation.name == "friction that grows with load"
     shares = dict(found.shares)

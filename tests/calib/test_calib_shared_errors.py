@@ -8,18 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.small_runs import small_run
 from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.pipeline import stages
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import Fits, Refinement, with_shared_error
 from deal_hw.calib.report.verdict import trust
-from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import unexplained
 from deal_hw.calib.validation.settings import Validation
@@ -215,15 +214,7 @@ def suspected(tmp_path: Path) -> tuple[CalibrationRun, FoundError, list[Progress
     """Return a run on right recordings, a suspicion that they are wrong, and what the run reports."""
     right = problem("pendulum", None, tmp_path)
     printed: list[Progress] = []
-    rng = np.random.default_rng(0)
-    run = CalibrationRun(
-        problem=right,
-        budget=Budget(population=20, generations=4),
-        rng=rng,
-        attempts=Restarts(Eki(), rng, None),
-        settings=Validation(),
-        progress=printed.append,
-    )
+    run = small_run(right, progress=printed.append)
     return run, FoundError(tuple(shared_errors(right))[:1], 1.0, 100.0, 500.0, right, 10), printed
 
 
