@@ -369,9 +369,7 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     """Return when the residual comes in bursts; None where it does not."""
     power: list[FloatArray] = []
     values: list[FloatArray] = []
-    for time_s, of_episode, rows in zip(known.time_s, known.rows, residual, strict=True):
-        # The rows of the start states' prior come last.
-        r = rows[:, : rows.shape[1] - of_episode.start.shape[2]].reshape(*time_s.shape, -1)
+    for r in known.by_sample(residual):
         power.append(np.sum(r**2, axis=2).ravel())
         values.append(r.ravel())
     each, time = np.concatenate(power), np.concatenate([t.ravel() for t in known.time_s])

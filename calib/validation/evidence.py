@@ -17,6 +17,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
+from deal_hw.calib.fit.solver import correlated_samples
 from deal_hw.calib.validation.cause_words import SearchedKinds
 from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.signatures import (
@@ -135,11 +136,21 @@ class Evidence:
             left.append(dataclasses.replace(rows, residual=residual))
         return left
 
+    def by_sample(self, residual: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return residuals, (W, R) per episode, as (W, H, M), without the rows of the start states' prior."""
+        return [
+            r[:, : r.shape[1] - rows.start.shape[2]].reshape(*time_s.shape, -1)
+            for time_s, rows, r in zip(self.time_s, self.rows, residual, strict=True)
+        ]
+
     @cached_property
-    def count(self) -> int:
-        """Degrees of freedom of the residuals, which are 0 where a sample is missing."""
+    def count(self) -> float:
+        """Number of independent residuals: degrees of freedom over the residuals' correlation time."""
+        # A missing sample has a residual of 0.
         measured = sum(int(np.count_nonzero(r)) for r in self._rest)
-        return max(measured - sum(len(r.start) * int(r.start.shape[2]) for r in self.rows), 1)
+        degrees = max(measured - sum(len(r.start) * int(r.start.shape[2]) for r in self.rows), 1)
+        residual = self.by_sample(self.residual([]))
+        return degrees / correlated_samples(residual, residual[0].shape[1])
 
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
@@ -150,12 +161,24 @@ class Evidence:
 
     def _held_out(self, taken: Sequence[Signature]) -> float:
         matrix, vector, squares, prior = self._normal(taken)
+        P, total = len(self.prior), matrix.sum(axis=0) + np.diag(prior)
+        # All windows fit the parameters, with signatures and without (Frisch and Waugh 1933). What a part of
+        # them hardly shows would else predict the rest worse than no change, and a signature would gain by
+        # undoing that. What is left out is for the signatures alone.
+        own = np.linalg.solve(total[:P, :P], vector.sum(axis=0)[:P])
+        moved = np.linalg.solve(total[:P, :P], total[:P, P:])
+        left = vector - matrix[:, :, :P] @ own
+        squares = squares - (vector[:, :P] + left[:, :P]) @ own
+        half = matrix[:, P:] - moved.T @ matrix[:, :P]
+        vector, matrix = left[:, P:] - left[:, :P] @ moved, half[:, :, P:] - half[:, :, :P] @ moved
         # So that no fold leaves out a whole recording, which may have a zero of its own.
         fold = fold_numbers(len(squares), FOLDS, max(ROUNDS, len(self.recordings)))
         cost = 0.0
         for k in range(FOLDS):
             mine, others = fold == k, fold != k
-            found = np.linalg.solve(matrix[others].sum(axis=0) + np.diag(prior), vector[others].sum(axis=0))
+            found = np.linalg.solve(
+                matrix[others].sum(axis=0) + np.diag(prior[P:]), vector[others].sum(axis=0)
+            )
             each = squares - 2 * vector @ found + np.einsum("i,wij,j->w", found, matrix, found)
             cost += float(each[mine].sum())
         return cost

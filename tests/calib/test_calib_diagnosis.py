@@ -74,6 +74,33 @@ def test_damping_that_no_parameter_has() -> None:
     assert _named(wrong, (wrong,)) == []
 
 
+def test_a_slow_random_force_is_no_cause() -> None:
+    """Neighbouring residuals are alike, so a tenth of them looks like a cause by chance in some windows.
+
+    Counted as independent, they would name one on half of these robots.
+    """
+    v, _ = knee_motion()
+    named = 0
+    for seed in range(10):
+        force = np.cumsum(np.random.default_rng(seed).normal(scale=0.03, size=v.shape), axis=1)
+        named += any(cause.code not in ("contact", "delay") for cause in _named(moved_by(force)))
+    assert named <= 1
+
+
+def test_a_parameter_that_other_windows_hardly_show_makes_no_cause() -> None:
+    """All windows fit it, so that no cause gains by undoing what the others made of it."""
+    v, _ = knee_motion()
+    seen = np.where(fold_numbers(WINDOWS, 4, 2) == 0, 1.0, 0.03)[:, None]
+    force = np.cumsum(np.random.default_rng(0).normal(scale=0.03, size=v.shape), axis=1)
+    known = knee_evidence(moved_by(force), (moved_by(-v) * seen,))
+    fitted = sum(float(np.sum(r**2)) for r in known.residual([]))
+    assert known.held_out([]) == pytest.approx(fitted, rel=1e-6)
+    # A cause that is the parameter explains nothing where that is seen, and is in the other windows.
+    damping = moved_by(-0.3 * v)
+    assert [cause.code for cause in name_causes(knee_evidence(damping, (damping * seen,)))] == ["damping"]
+    assert name_causes(known) == []
+
+
 @pytest.mark.parametrize(
     ("cause", "force"), [("inertia", lambda a: 0.05 * a), ("load", lambda a: 0.3 + 0 * a)]
 )
