@@ -33,7 +33,7 @@ SEARCHING = frozenset({"default", "output-error", "output-error-no-laws"})
 """Pipelines with a search. What laws gain is measured beside the last one."""
 
 METHODS: dict[str, str] = {
-    "default": "deal_hw.calib.pipeline.stages:CalibrationPipeline",
+    "default": "deal_hw.calib.pipeline.output_error_fits:default_method",
     "eki": "deal_hw.calib.search.eki:Eki",
     "deal": "deal_hw.calib.search.deal:Deal",
     "deal-critic": "deal_hw.calib.search.deal:critic_alone",

@@ -44,10 +44,10 @@ from deal_hw.calib.fit.output_error import (
     prediction_rmse,
     standing_rmse,
 )
-from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, at_parameters
+from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, at_parameters
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
-from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits
+from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits, Refinement
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Z90, Budget, CalibrationMethod, CalibrationResult
@@ -140,10 +140,12 @@ class OutputErrorFits(Fits):
     Attributes:
         settings: The settings.
         first: The fits from the nominal values, once they are made: of short windows, then of growing ones.
+        given: Result of a search that was made before; those fits begin where its refinement ended.
     """
 
     settings: OutputErrorSettings = field(default_factory=OutputErrorSettings)
     first: tuple[OutputErrorFit, ...] = ()
+    given: CalibrationResult | None = None
 
     def started(self, run: CalibrationRun) -> OutputErrorFits:
         """Fit short and long windows from the nominal values. See :meth:`Fits.started`."""
@@ -158,6 +160,18 @@ class OutputErrorFits(Fits):
         windows = self._windows(run, problem, short.member)
         run.offer("fit of long windows", windows[-1])
         return dataclasses.replace(self, first=(short, *windows))
+
+    def continued(self, run: CalibrationRun, searched: CalibrationResult, refined: Refined) -> FitOutcome:
+        """Fit predictions from where a search's refinement ended, and take the best predictor.
+
+        The residual of the refinement, whose start states are fitted, is that of the diagnosis.
+        """
+        problem = _joined_stretches(run.problem)
+        short = fit_output_error(problem, refined.theta, refined.latency_s, self.settings.first)
+        windows = self._windows(run, problem, short.member)
+        run.offer("fit of long windows", windows[-1])
+        fits = dataclasses.replace(self, first=(short, *windows), given=searched)
+        return fits.best(dataclasses.replace(run, local=refined))
 
     def tries_laws(self, run: CalibrationRun) -> bool:
         """Return whether the cross-validation has candidates with laws."""
@@ -178,11 +192,11 @@ class OutputErrorFits(Fits):
         problem = first.plain.problem
         # The fits continue from the search's estimate, so it only has to find the neighbourhood.
         run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
-        searched = self._searched(run, problem, first, windows)
+        searched = self.given or self._searched(run, problem, first, windows)
         run.offer("search", searched)
         # Drawn after the search, so that a resumed run draws the same seed.
         seed = int(run.rng.integers(2**32))
-        better = self._better_start(problem, first, searched)
+        better = self.given is None and self._better_start(problem, first, searched)
         if better:
             windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
         decided = LawfulChoice(Choice("long", {}, settings.long_s, note="without folds"))
@@ -432,6 +446,11 @@ class OutputErrorFits(Fits):
         return agreement(known, fits, both, searched, problem.steps - before)
 
 
+def default_method(search: CalibrationMethod[Problem], name: str = "default") -> CalibrationPipeline:
+    """Return `default`: local fit, search, refinement, and far from the noise fits of predictions."""
+    return CalibrationPipeline(search, name, fits=Refinement(predictions=BRIEF))
+
+
 def output_error_method(
     search: CalibrationMethod[Problem], name: str = "output-error"
 ) -> CalibrationPipeline:
@@ -452,6 +471,14 @@ def local() -> CalibrationPipeline:
     """
     return CalibrationPipeline(nominal(), "local", Validation(cross_validation=False), fits=OutputErrorFits())
 
+
+BRIEF = OutputErrorFits(
+    OutputErrorSettings(
+        windows_s=(0.15, 0.3), compared_s=0.15, mismatch_s=0.2, first=Recipe(seconds=0.1), search_always=False
+    )
+)
+"""Fits of predictions of a robot whose joints are not all held by servos. A pole that falls forgets in some
+0.3 s where it was: the time constant of 0.5 m is 0.2 s. In half of that friction shows little beside inertia."""
 
 FORCES = ("servo_stiffness", "servo_damping", "dof_frictionloss")
 """Kinds of parameters that scale with all forces."""

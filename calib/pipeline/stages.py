@@ -15,7 +15,7 @@ import math
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -95,6 +95,13 @@ class Fits(abc.ABC):
     @abc.abstractmethod
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit, choose, and estimate the uncertainty."""
+
+
+class FitsOfPredictions(Protocol):
+    """Fits that continue where a refinement ended."""
+
+    def continued(self, run: CalibrationRun, searched: CalibrationResult, refined: Refined) -> FitOutcome:
+        """Return the fit that predicts best, after a search's result and its refinement."""
 
 
 DIVERGED = (
@@ -238,9 +245,14 @@ class Refinement(Fits):
     fewer simulations. If no refinement from a drawn point ends lower, the model is wrong, and nothing else is
     searched. Later searches use the whole budget, except for a floating base: there, long windows with
     contacts carry little information.
+
+    Attributes:
+        restarts: When drawn points and other searches follow.
+        predictions: What follows where no values explain the recordings; None: the refinement is the result.
     """
 
     restarts: RestartSettings = RESTARTS
+    predictions: FitsOfPredictions | None = None
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search and refine. See :meth:`Fits.best`."""
@@ -272,7 +284,23 @@ class Refinement(Fits):
             if local.shooting.length >= refined.shooting.length:
                 refined = local
         run, refined = with_wider_ranges(run, refined, partial(_refined_again, run))
+        if self.predictions is not None and far_from_noise(run, refined):
+            run.say("fit", "no values explain the recordings, so fits of predictions follow, and the best")
+            return self.predictions.continued(run, searched, refined)
         return conclude_fit(run, searched, refined, attempt)
+
+
+def far_from_noise(run: CalibrationRun, refined: Refined) -> bool:
+    """Return whether a residual is so large that fitted start states only hide how a model is wrong.
+
+    Where folds over the motions are asked for, the fit that predicts best is then better than the one that
+    explains most. A free base has its own windows (`gait`), and a given residual scale its own meaning.
+    """
+    from deal_hw.calib.validation.explain import FAR
+
+    problem = run.problem
+    known = problem.known_std is not None or problem.noise_free
+    return run.settings.cross_validation and refined.chi2 > FAR and problem.robot.base is None and not known
 
 
 def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refined | None:

@@ -18,13 +18,18 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice, law_errors
-from deal_hw.calib.pipeline.output_error_fits import OutputErrorFits
-from deal_hw.calib.pipeline.stages import CalibrationPipeline, with_explanation
+from deal_hw.calib.pipeline.output_error_fits import BRIEF, OutputErrorFits
+from deal_hw.calib.pipeline.stages import (
+    CalibrationPipeline,
+    far_from_noise,
+    with_explanation,
+    without_search,
+)
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation.cross_validation import Choice
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
-from deal_hw.calib.validation.explain import DECISIVE, explained, try_explanations
+from deal_hw.calib.validation.explain import DECISIVE, FAR, explained, try_explanations
 from deal_hw.calib.validation.explanations import EXPLANATIONS
 from deal_hw.calib.validation.explanations import PLAY as PLAY_LAW
 from deal_hw.calib.validation.settings import Validation
@@ -147,6 +152,35 @@ def test_a_law_is_taken_for_what_it_predicts(fault: Fault | None, law: str | Non
     assert found.population is None
     (alarm,) = [one for one in found.alarms if "falls with speed" in one.seen]
     assert "elbow.friction_stribeck" in alarm.do
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "fault", "law"),
+    [("pendulum", "friction", "friction that falls with speed"), ("double-pendulum", "mass", None)],
+)
+def test_a_law_is_taken_after_a_refinement_far_from_the_noise(
+    kind: str, fault: Fault, law: str | None
+) -> None:
+    """As on a real arm that torques drive: fits of short predictions follow where the refinement ended."""
+    _, problem, fit = truth(kind, fault)
+    run = small_run(problem)
+    found = BRIEF.continued(run, without_search(problem, run.budget, fit), fit)
+    assert found.facts.get("law", {}).get("law") == law
+    assert len(found.theta) == len(problem.space) + (2 if law else 0)
+    if law is not None:
+        assert max(found.facts["law"]["error_ratio"]) < 0.6
+
+
+def test_only_a_residual_far_from_the_noise_is_fitted_by_predictions() -> None:
+    """Near it, and where nobody compares predictions, fitted start states tell more."""
+    _, problem, fit = truth("pendulum", None)
+    run, poor = small_run(problem), dataclasses.replace(fit, chi2=FAR + 1)
+    assert far_from_noise(run, poor) and not far_from_noise(run, fit)
+    unchecked = Validation(cross_validation=False)
+    assert not far_from_noise(dataclasses.replace(run, settings=unchecked), poor)
+    known = problem.on(problem.episodes, np.ones(2 * problem.coordinates))
+    assert not far_from_noise(dataclasses.replace(run, problem=known), poor)
 
 
 @pytest.mark.slow
