@@ -21,8 +21,8 @@ these recordings add a position loop of unknown gains. The drive answers a comma
 it, so the reading of a row is the torque since the row before. Faster recordings are thinned to the 200 rows
 a second of the others; torques are then means.
 
-Near the top, people push the pendulum to show that it swings up again. Around motion that needs over 4 N·m
-more than drive and gravity give, 0.1 s of rows are left out. Some recordings of the source are no use here:
+A recording is cut where the pendulum has arrived: half a second within 0.2 rad of upright. After that, people
+push it to show that it swings up again, with up to 13 N·m. Some recordings of the source are no use here:
 
     energy_shaping/data_measured_1kg.csv  has another weight; it is refused
     ilqr                                  50 rows a second; it is refused
@@ -49,16 +49,14 @@ from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.errors import DealHwError
 from deal_hw.types import FloatArray
 
-Mask = np.ndarray[Any, np.dtype[np.bool_]]
-
 FILE = "data_measured.csv"
 WEIGHT_KG, ROD_KG, LENGTH_M = 0.546, 0.13, 0.5
 """The weight at the end and the rod with its mounting parts: the source's description of the test bench."""
 ROTOR_KG_M2, GEAR = 6.0719e-5, 6.0
 """Rotor's inertia before the gear: the source's data of the drive."""
 RATE_HZ = 200.0
-PUSH_NM, PUSH_S, OVER_S = 4.0, 0.1, 0.03
-"""Torque of a hand [N·m], rows left out before and after it [s], half the time of its acceleration [s]."""
+NEAR_TOP_RAD, STANDS_S = 0.2, 0.5
+"""A swing-up is over where the pendulum stays so near to upright for so long."""
 
 COLUMNS = """\
 # Pendulum of dfki-ric-underactuated-lab/torque_limited_simple_pendulum (BSD-3-Clause): meaning of the arrays.
@@ -83,22 +81,12 @@ MODEL = """\
 """
 
 
-def centre_and_inertia() -> tuple[float, float]:
-    """Return the centre of mass below the axis [m] and the inertia about the axis [kg·m²].
-
-    The weight is a point and the rod is uniform.
-    """
-    centre = (WEIGHT_KG + ROD_KG / 2) * LENGTH_M / (WEIGHT_KG + ROD_KG)
-    return centre, (WEIGHT_KG + ROD_KG / 3) * LENGTH_M**2
-
-
 def model() -> str:
-    """Return the MJCF of the pendulum by the source's description."""
-    centre, inertia = centre_and_inertia()
+    """Return the MJCF of the pendulum by the source's description: a point on a uniform rod."""
     mass = WEIGHT_KG + ROD_KG
-    return MODEL.format(
-        rotor=ROTOR_KG_M2 * GEAR**2, centre=centre, mass=mass, inertia=inertia - mass * centre**2
-    )
+    centre = (WEIGHT_KG + ROD_KG / 2) * LENGTH_M / mass
+    inertia = (WEIGHT_KG + ROD_KG / 3) * LENGTH_M**2 - mass * centre**2
+    return MODEL.format(rotor=ROTOR_KG_M2 * GEAR**2, centre=centre, mass=mass, inertia=inertia)
 
 
 def read_log(path: Path) -> dict[str, Any]:
@@ -118,13 +106,13 @@ def read_log(path: Path) -> dict[str, Any]:
             "have one rate"
         )
     stamps, mean = mean_torque(time, torque)
-    pushed = np.interp(stamps, time, by_hand(time, position, torque)) > 0
-    kept = ~near(stamps, stamps[pushed])[:-1]
+    position = np.interp(stamps, time, position)
+    last = arrival(stamps, position)
     return {
-        "time": stamps[:-1][kept],
-        "position": np.interp(stamps, time, position)[:-1][kept],
-        "velocity": np.interp(stamps, time, velocity)[:-1][kept],
-        "torque": mean[kept],
+        "time": stamps[:last],
+        "position": position[:last],
+        "velocity": np.interp(stamps, time, velocity)[:last],
+        "torque": mean[:last],
     }
 
 
@@ -139,28 +127,17 @@ def mean_torque(time: FloatArray, torque: FloatArray) -> tuple[FloatArray, Float
     return stamps, np.diff(np.interp(stamps, time, impulse)) / np.diff(stamps)
 
 
-def by_hand(time: FloatArray, position: FloatArray, torque: FloatArray) -> Mask:
-    """Return in which rows a hand pushes, (T,).
+def arrival(time: FloatArray, position: FloatArray) -> int:
+    """Return the row from which the pendulum stays near the top, or the last one, which has no torque.
 
     Args:
         time: Of each row, (T,) [s].
         position: (T,) [rad].
-        torque: Measured, (T,) [N·m].
     """
-    centre, inertia = centre_and_inertia()
-    before, after = (np.interp(time + shift, time, position) for shift in (-OVER_S, OVER_S))
-    inertial = (inertia + ROTOR_KG_M2 * GEAR**2) * (after - 2 * position + before) / OVER_S**2
-    gravity = (WEIGHT_KG + ROD_KG) * 9.81 * centre * np.sin(position)
-    shifts = np.linspace(-OVER_S, OVER_S, 5)
-    motor = np.max([np.abs(np.interp(time + shift, time, torque)) for shift in shifts], axis=0)
-    inside = (time >= time[0] + OVER_S) & (time <= time[-1] - OVER_S)
-    return np.asarray(inside & (np.abs(inertial + gravity) > motor + PUSH_NM))
-
-
-def near(time: FloatArray, moments: FloatArray) -> Mask:
-    """Return which rows are within 0.1 s of one of the moments [s], (T,)."""
-    away = np.abs(time[:, None] - moments)
-    return np.asarray(away.min(axis=1, initial=np.inf) <= PUSH_S)
+    away = np.flatnonzero(np.abs(np.mod(position, 2 * np.pi) - np.pi) >= NEAR_TOP_RAD)
+    ends = np.append(time[away[1:]], time[-1])
+    stays = away[ends - time[away] > STANDS_S]
+    return int(min(stays[0] + 1, time.size - 1)) if stays.size else time.size - 1
 
 
 def main(arguments: list[str] | None = None) -> int:

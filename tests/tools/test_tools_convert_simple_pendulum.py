@@ -1,4 +1,4 @@
-"""The converter of the pendulum on an AK80-6: torques between rows, one rate, no pushes by hand."""
+"""The converter of the pendulum on an AK80-6: torques between rows, one rate, the swing-up alone."""
 
 from __future__ import annotations
 
@@ -57,20 +57,21 @@ def test_faster_recordings_are_thinned_and_keep_the_impulse(rate_hz: float) -> N
     assert np.sum(mean) * 0.005 == pytest.approx(impulse, abs=0.0051)
 
 
-def test_a_push_by_hand_is_left_out(tmp_path: Path) -> None:
-    """0.1 s around motion that neither the drive nor gravity makes; a fast swing of the drive stays."""
+@pytest.mark.parametrize("top", [np.pi, -np.pi, 5 * np.pi])
+def test_a_recording_ends_where_the_pendulum_arrives(top: float, tmp_path: Path) -> None:
+    """It passes the top at 1 s, and stays there from 2 s on; then hands push it."""
+    time = np.arange(800) / 200
+    position = np.interp(time, [0.0, 1.0, 1.3, 2.0, 3.0, 4.0], [top - 3, top, top + 2, top, top, top - 9])
+    found = convert_simple_pendulum.read_log(log(tmp_path, "sac", time, position, position))
+    # From 2 rad beside the top at 1.3 s it comes to 0.2 rad after 0.9 of the next 0.7 s.
+    assert found["time"][-1] == pytest.approx(1.3 + 0.9 * 0.7, abs=0.01)
+    assert all(values.size == found["time"].size for values in found.values())
+
+
+def test_a_recording_that_does_not_arrive_is_kept(tmp_path: Path) -> None:
+    """All of its rows but the last one, which has no torque."""
     time, position = swing(200.0)
-    # 0.06 rad more within 0.03 s, from 1.5 s on: about 130 rad/s², 19 N·m.
-    pushed = position + 0.06 * np.clip((time - 1.5) / 0.03, 0, 1)
-    path = log(tmp_path, "pushed", time, pushed, np.full_like(time, 0.5))
-    found = convert_simple_pendulum.read_log(path)
-    gap = np.diff(found["time"])
-    last = found["time"][np.argmax(gap)]
-    assert 0.2 < gap.max() < 0.35
-    assert 1.3 < last < 1.45
-    assert np.sum(gap > 0.006) == 1
-    driven = convert_simple_pendulum.read_log(log(tmp_path, "driven", time, pushed, np.full_like(time, 20.0)))
-    assert driven["time"].size == time.size - 1
+    assert convert_simple_pendulum.read_log(log(tmp_path, "a", time, position, position))["time"].size == 599
 
 
 def test_the_model_has_the_weight_and_the_rod(tmp_path: Path) -> None:
