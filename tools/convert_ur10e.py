@@ -5,6 +5,7 @@ of the work in "Practical Aspects of Model-Based Collision Detection" (Frontiers
 That repository has no licence: nothing of it is copied here, and this program reads your own copy.
 
     git clone https://github.com/shamilmamedov/dynamic_calibration
+    mkdir all
     cp dynamic_calibration/dataset_ur10e/{identification,validation}_data/*.csv all
     python tools/convert_ur10e.py all/ur-20_02_05-20sec_8harm.csv all/ur-20_02_06-*.csv \
         all/ur-20_02_10-20sec_7harm.csv all/ur-20_01_17-ptp_10_points.csv --out ur10e
