@@ -12,6 +12,10 @@ FOLDER has a folder of each robot, as the converters write them from the public 
     cartpole         convert_cartpole.py, six recordings v1_*; holds out v1_800 and v1_1700
     double_pendulum  the CSV files of docs/results/example-double-pendulum.md; holds out 02, 04 and 06
     bam_xl330        convert_bam.py; fits the P gains 100, 200 and 800, holds out 400
+    ur10e            convert_ur10e.py; fits motions of 5 and 6 February, holds out one of 10 February, and
+                     moves from point to point of 17 January
+    simple_pendulum  convert_simple_pendulum.py; fits sac and direct_collocation, holds out energy_shaping
+                     and ddp
 
 All methods get the same recordings, parameters and ranges:
 
@@ -75,6 +79,8 @@ class Robot:
 
 
 SO101_SWAPPED = ("chirp_sweep", "friction_gravity")
+UR10E_FITTED = ("ur-20_02_05-20sec_8harm", "ur-20_02_06-20sec_5harm", "ur-20_02_06-20sec_10harm")
+UR10E_HELD_OUT = ("ur-20_02_10-20sec_7harm", "ur-20_01_17-ptp_10_points")
 XL330_MOTIONS = ("sin_sin", "sin_time_square", "up_and_down")
 
 
@@ -115,6 +121,29 @@ def bam_xl330(folder: Path, made: Path) -> FilesSettings:
     )
 
 
+def ur10e(folder: Path, made: Path) -> FilesSettings:
+    """Return the inputs of the UR10e: motor currents as torques."""
+    del made
+    return FilesSettings(
+        model=folder / "ur10e.xml",
+        data=_npz(folder, UR10E_FITTED),
+        holdout=_npz(folder, UR10E_HELD_OUT),
+        columns=folder / "columns.yaml",
+        parameters=folder / "parameters.yaml",
+    )
+
+
+def simple_pendulum(folder: Path, made: Path) -> FilesSettings:
+    """Return the inputs of the pendulum on an AK80-6: measured torques."""
+    del made
+    return FilesSettings(
+        model=folder / "simple_pendulum.xml",
+        data=_npz(folder, ["sac", "direct_collocation"]),
+        holdout=_npz(folder, ["energy_shaping", "ddp"]),
+        columns=folder / "columns.yaml",
+    )
+
+
 ROBOTS: Mapping[str, Robot] = {
     "so101": Robot(so101_inputs, 5.0, 2.0, "so101"),
     "so101-other": Robot(
@@ -125,6 +154,8 @@ ROBOTS: Mapping[str, Robot] = {
     "cartpole": Robot(cartpole, 0.2, 0.2, "cartpole"),
     "double_pendulum": Robot(double_pendulum, 0.2, 0.2, "double_pendulum"),
     "bam_xl330": Robot(bam_xl330, 1.0, 1.0, "bam_xl330"),
+    "ur10e": Robot(ur10e, 0.3, 0.3, "ur10e"),
+    "simple_pendulum": Robot(simple_pendulum, 0.3, 0.3, "simple_pendulum"),
 }
 
 

@@ -79,6 +79,9 @@ def test_no_recording_is_both_fitted_and_held_out(name: str, tmp_path: Path) -> 
         *(f"traj_0_part{number}" for number in range(1, 5)),
         *(f"v1_{number}" for number in (0, 1, 5, 800, 1200, 1700)),
         *(f"kp{kp}-{motion}" for kp in (100, 200, 400, 800) for motion in score_real.XL330_MOTIONS),
+        *score_real.UR10E_FITTED,
+        *score_real.UR10E_HELD_OUT,
+        *("sac", "direct_collocation", "energy_shaping", "ddp"),
     ):
         (tmp_path / f"{stem}.npz").touch()
     for number in range(7):
