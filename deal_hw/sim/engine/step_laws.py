@@ -80,7 +80,7 @@ class StepLaws:
         self._served: list[int] = []
         if transmissions is not None and firmware is not None:
             self._served = np.flatnonzero(np.isin(transmissions.actuator, firmware.actuator)).tolist()
-        self._qvel = outputs("qvel")
+        self._qpos, self._qvel = outputs("qpos"), outputs("qvel")
         if self.loaded:
             # Outputs that are bound are copied after every step.
             self._bias, self._torque = outputs("qfrc_bias"), outputs("qfrc_actuator")
@@ -192,12 +192,32 @@ class StepLaws:
             forward: Computes the torques of all simulations.
         """
         rotors = self.transmissions
-        if rotors is not None and (self.loaded or rotors.fresh.any()):
-            rotors.begin(forward, self.firmware)
-        elif self.loaded:
-            if self.firmware is not None:
-                self.firmware.write()
+        if not self.loaded and (rotors is None or not rotors.fresh.any()):
+            return
+        if self.firmware is not None:
+            self.firmware.write(self._measured())
+        if rotors is None:
             forward()
+        else:
+            rotors.begin(forward, self._served)
+
+    def _measured(self) -> FloatArray | None:
+        """Return positions as encoders measure them, (N, nq); None where all are at the joints."""
+        if self.transmissions is None or not self.transmissions.at_motor:
+            return None
+        found = self._qpos.copy()
+        self.transmissions.report("qpos", found)
+        return found
+
+    def report(self, name: str, values: FloatArray) -> None:
+        """Put what encoders at motors measure into a field of MjData.
+
+        Args:
+            name: The field; those other than "qpos" and "qvel" stay.
+            values: Its values now, (N, ...).
+        """
+        if self.transmissions is not None:
+            self.transmissions.report(name, values)
 
     def write(self) -> None:
         """Write friction, limits and the servos' efforts for the next step, whose controls are set."""
@@ -212,7 +232,7 @@ class StepLaws:
             low, high = effort_range(self._qvel[:, self._driven] * self._turns, self._stall, self._free_speed)
             self._range[:, self._actuator, 0], self._range[:, self._actuator, 1] = low, high
         if self.firmware is not None:
-            self.firmware.write()
+            self.firmware.write(self._measured())
         if self.transmissions is not None:
             self.transmissions.write(self._served)
 
@@ -256,6 +276,7 @@ def rollout(
             laws.follow()
             for name, field in fields.items():
                 record[name][:, step] = field
+                laws.report(name, record[name][:, step])
     return record
 
 

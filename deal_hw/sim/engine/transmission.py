@@ -2,9 +2,9 @@
 
 A joint's ``dof_armature`` is the rotor's inertia. It is taken out of the model, and the rotor gets an angle
 and a speed of its own. The actuator's gains, constant effort and limit give the motor's torque: from the
-position of the link, where the encoder is, and the speed of the motor. In the model the actuator is a
-constant torque, which is written before each step, and the armature is what the link feels of the rotor.
-So ``qfrc_actuator`` is what the transmission passes.
+position where the encoder is, of the link or of the motor, and the speed of the motor. In the model the
+actuator is a constant torque, which is written before each step, and the armature is what the link feels of
+the rotor. So ``qfrc_actuator`` is what the transmission passes.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy.typing as npt
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName
-from deal_hw.sim.engine.servo_firmware import ServoFirmware
 from deal_hw.sim.laws.motor import effort_range
 from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
 from deal_hw.sim.parameters.laws import FREE_SPEED
 from deal_hw.sim.parameters.transmission import (
+    ENCODER_AT_MOTOR,
     TRANSMISSION_DAMPING,
     TRANSMISSION_PLAY,
     TRANSMISSION_STIFFNESS,
@@ -33,7 +33,13 @@ from deal_hw.types import FloatArray
 
 Outputs = Callable[[str], FloatArray]
 
+Mask = npt.NDArray[np.bool_]
+
 _FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+
+_SETTLING = 2
+"""Times that a link's start position follows from its load there. Each leaves a share of the error: what the
+load changes with the position over the transmission's stiffness, 1/65 for the arm of the tests."""
 
 
 def check_engine(space: ParameterSpace, engine: EngineName) -> None:
@@ -74,6 +80,7 @@ class Transmissions:
     Attributes:
         names: Names of the actuators, B of them.
         actuator: Their numbers.
+        at_motor: Whether any encoder is at the motor.
         fresh: Whether the rotors of a member follow from its state at the next beginning, (N,).
         angle: Angles of the motors, (N, B) [rad or m].
         speed: Their speeds, (N, B) [rad/s or m/s].
@@ -88,8 +95,17 @@ class Transmissions:
         names = self.names = list(given[TRANSMISSION_STIFFNESS])
         actuator = self.actuator = [element_id(model, "actuator", name) for name in names]
         joint = model.actuator_trnid[actuator, 0]
+        turned = {name for name, _ in values.get(ENCODER_AT_MOTOR, ())}
+        at_motor = [k for k, j in enumerate(joint) if model.joint(int(j)).name in turned]
         dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
         self._actuator, self._dof, self._place = as_slice(actuator), as_slice(dof), as_slice(place)
+        # Transmissions with the encoder at the motor, and where their joints have positions and speeds.
+        self._turned = as_slice(at_motor)
+        self._reported = {
+            "qpos": as_slice([place[k] for k in at_motor]),
+            "qvel": as_slice([dof[k] for k in at_motor]),
+        }
+        self.at_motor = bool(at_motor)
         self._qpos, self._qvel = outputs("qpos"), outputs("qvel")
         self._control, self._torque, self._qacc = outputs("ctrl"), outputs("qfrc_actuator"), outputs("qacc")
         self._gain, self._bias, self._range = (fields.get(name) for name in _FIELDS)
@@ -133,7 +149,7 @@ class Transmissions:
         self.angle, self.speed = np.zeros(shape), np.zeros(shape)
         # The torque that the transmissions pass.
         self._passed = np.zeros(shape)
-        self.fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
+        self.fresh: Mask = np.ones(shape[0], dtype=bool)
         self._moves = False
         self.read_sent()
 
@@ -156,7 +172,9 @@ class Transmissions:
         self._least, self._most = (np.ascontiguousarray(ends[..., k]) for k in (0, 1))
         self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
         self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
-        self._couplings = Couplings(self.law, self._resistance)
+        own = np.zeros_like(self._per_position)
+        own[:, self._turned] = self._per_position[:, self._turned]
+        self._couplings = Couplings(self.law, self._resistance, own)
         self._write_motors(np.zeros(len(self.fresh), dtype=bool))
 
     def restore_sent(self) -> None:
@@ -187,29 +205,56 @@ class Transmissions:
         if self._simple_dof:
             self._derived[:, self._simple_dof] = self._alone + inertia[:, self._simple]
 
-    def begin(self, forward: Callable[[], None], firmware: ServoFirmware | None) -> None:
+    def begin(self, forward: Callable[[], None], served: list[int]) -> None:
         """Set the states of fresh rotors: they move with their links, and their springs pass what is needed.
 
-        That is the motor's torque less what accelerates the rotor together with its link.
+        That is the motor's torque less what accelerates the rotor together with its link. The position in
+        the state is that of the encoder. Where it is the motor's, the link gets its own one: that at which
+        its load bends the spring as much.
 
         Args:
             forward: Computes torques and accelerations of all simulations.
-            firmware: What servos make of their errors; None for servos without such a law.
+            served: Places in B of servos whose firmware has just written their constant efforts.
         """
-        rows = self.fresh
-        self._write_motors(rows)
-        if firmware is not None:
-            firmware.write()
-            # Members that go on pass the torque of their last step.
-            sent = self._bias[:, self._actuator, 0]
-            self._bias[:, self._actuator, 0] = np.where(rows[:, None], sent, self._passed / self._gear)
+        rows, link = self.fresh[:, None], self._qvel[:, self._dof]
+        read = self._qpos[:, self._place].copy()
+        self.speed = np.where(rows, link, self.speed)
+        self.angle = np.where(rows, read, self.angle)
+        torque, held = self._motors(read, served)
+        acting = torque - (self._resistance if held is None else np.where(held, 0.0, self._resistance)) * link
+        self._write_motors(np.zeros_like(self.fresh))
+        # Members that go on pass the torque of their last step.
+        self._bias[:, self._actuator, 0] = np.where(rows, acting, self._passed) / self._gear
+        self._put_inertia(np.where(rows, self.law.inertia, self._couplings.inertia))
+        bent = self._bent(forward)
+        if self.at_motor:
+            at, motors = self._reported["qpos"], self._turned
+            for _ in range(_SETTLING):
+                there = read[:, motors] - bent[:, motors]
+                self._qpos[:, at] = np.where(rows, there, self._qpos[:, at])
+                bent = self._bent(forward)
+            bent[:, motors] = read[:, motors] - self._qpos[:, at]
+        self.angle = np.where(rows, self._qpos[:, self._place] + bent, self.angle)
+        self.fresh[:] = False
+        self._write_motors(self.fresh)
+
+    def _bent(self, forward: Callable[[], None]) -> FloatArray:
+        """Return how far transmissions bend that move rotors and links as one in this state, (N, B)."""
         forward()
-        link = self._qvel[:, self._dof]
-        passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
-        self.speed[rows] = link[rows]
-        self.angle[rows] = (self._qpos[:, self._place] + self.law.deflection(passed))[rows]
-        rows[:] = False
-        self._write_motors(rows)
+        return self.law.deflection(self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof])
+
+    def report(self, name: str, values: FloatArray) -> None:
+        """Put what encoders at motors measure into positions or speeds of the simulations.
+
+        Args:
+            name: The field of MjData, "qpos" or "qvel"; others stay.
+            values: Its values, (N, ...).
+        """
+        if self.at_motor and name in self._reported:
+            at = self._reported[name]
+            motors = (self.angle if name == "qpos" else self.speed)[:, self._turned]
+            # A fresh state is as it was set: by what the encoder has measured.
+            values[:, at] = np.where(self.fresh[:, None], values[:, at], motors)
 
     def write(self, served: list[int]) -> None:
         """Write torques and inertias for the next step, whose controls are set.
@@ -217,32 +262,46 @@ class Transmissions:
         Args:
             served: Places in B of servos whose firmware has just written their constant efforts.
         """
-        if served:
-            efforts = self._bias[:, [self.actuator[k] for k in served], 0]
-            self._constant[:, served] = self._gear[served] * efforts
         link = self._qpos[:, self._place].copy()
-        control = self._control[:, self._actuator]
-        if self._bounded:
-            low, high = self._control_range
-            control = np.minimum(np.maximum(control, low), high)
-        torque = self._per_control * control + self._constant - self._per_position * link
-        beyond = None
-        if self._any_limited:
-            least, most = self._limits()
-            acting = torque - self._resistance * self.speed
-            able = np.minimum(np.maximum(acting, least), most)
-            beyond = able != acting
-            if np.count_nonzero(beyond):
-                torque = np.where(beyond, able, torque)
-            else:
-                beyond = None
+        torque, held = self._motors(link, served)
         self._passed, changed = self._couplings.couple(
-            self.angle - link, self.speed, self._qvel[:, self._dof], torque, beyond
+            self.angle - link, self.speed, self._qvel[:, self._dof], torque, held
         )
         self._bias[:, self._actuator, 0] = self._passed / self._gear
         if changed:
             self._put_inertia(self._couplings.inertia)
         self._moves = True
+
+    def _motors(self, link: FloatArray, served: list[int]) -> tuple[FloatArray, Mask | None]:
+        """Return torques of the motors, (N, B), and where they are at their limits; None for nowhere.
+
+        They are those at standstill, before what the motors lose with their speeds, or the limits.
+
+        Args:
+            link: Positions of the links, (N, B).
+            served: As in :meth:`write`.
+        """
+        if served:
+            efforts = self._bias[:, [self.actuator[k] for k in served], 0]
+            self._constant[:, served] = self._gear[served] * efforts
+        control = self._control[:, self._actuator]
+        if self._bounded:
+            low, high = self._control_range
+            control = np.minimum(np.maximum(control, low), high)
+        read = link
+        if self.at_motor:
+            read = link.copy()
+            read[:, self._turned] = self.angle[:, self._turned]
+        torque = self._per_control * control + self._constant - self._per_position * read
+        if not self._any_limited:
+            return torque, None
+        least, most = self._limits()
+        acting = torque - self._resistance * self.speed
+        able = np.minimum(np.maximum(acting, least), most)
+        beyond = able != acting
+        if not np.count_nonzero(beyond):
+            return torque, None
+        return np.where(beyond, able, torque), beyond
 
     def _limits(self) -> tuple[FloatArray, FloatArray]:
         """Return the least and largest torque of the motors at their speeds, (N, B) each."""

@@ -28,6 +28,10 @@ ring, and at least that of the spring, so that stiff ones move as the rigid mode
 stable. A mode loses speed by the factor ``(1 - (1 - share) x) / (1 + share x + share' a)``, where share' is
 the spring's. The roots of a step lie within the unit circle for
 ``4 + 2 (2 share - 1) x + (2 share' - 1) a > 0``.
+
+A servo whose encoder is at the motor pulls the rotor to its goal as a spring of its stiffness kp does. That
+spring has a share of its own, ``max(0, 1 - J / (h² kp))``, so that a light rotor and a stiff servo do not
+blow up either.
 """
 
 from __future__ import annotations
@@ -104,12 +108,16 @@ class TransmissionLaw:
         least = np.maximum(0.5, self.spring_share)
         return np.asarray(np.maximum(least, 1 - 1 / np.maximum(lost, 1.0)))
 
-    def factors(self, resistance: FloatArray, *, closed: bool) -> FloatArray:
+    def factors(
+        self, resistance: FloatArray, *, closed: bool, stiffness: FloatArray | float = 0.0
+    ) -> FloatArray:
         """Return what a step multiplies by where the gaps are closed, or where they are open, (12, N, B).
 
         Args:
             resistance: What the motor's torque loses with its speed, c, (N, B) [N·m·s/rad or N·s/m].
             closed: Whether the gaps are closed.
+            stiffness: What it loses with its angle, kp, (N, B) [N·m/rad or N/m]; 0 for an encoder at the
+                link.
 
         Returns:
             Factors of deflection, motor's speed, link's speed and motor's torque in the motor's speed at the
@@ -119,7 +127,9 @@ class TransmissionLaw:
         """
         end = self.damper_share(resistance)
         carried, none = self.inertia / self.step_s, np.zeros_like(resistance)
-        rotor, kept = carried + end * resistance, carried - (1 - end) * resistance
+        turned = self.step_s**2 * stiffness / self.inertia
+        held = stiffness * self.step_s * (1 - 1 / np.maximum(turned, 1.0))
+        rotor, kept = carried + end * resistance + held, carried - (1 - end) * resistance
         spring, damper = (self.stiffness, (1 - end) * self.damping) if closed else (none, none)
         grip = spring * self.ahead_s + (end * self.damping if closed else none)
         both = rotor + grip
@@ -140,16 +150,21 @@ class Couplings:
     Args:
         law: The transmissions.
         resistance: What the motors' torques lose with their speeds, c, (N, B) [N·m·s/rad or N·s/m].
+        stiffness: What they lose with the motors' own angles, (N, B) [N·m/rad or N/m]; 0 for encoders at the
+            links.
 
     Attributes:
         inertia: What the links have beside their own, (N, B) [kg·m² or kg].
     """
 
-    def __init__(self, law: TransmissionLaw, resistance: FloatArray) -> None:
+    def __init__(
+        self, law: TransmissionLaw, resistance: FloatArray, stiffness: FloatArray | float = 0.0
+    ) -> None:
         self._law, shape = law, resistance.shape
         # By gap (closed, open), then by motor (free, held).
+        motors = (resistance, stiffness), (0 * resistance, 0.0)
         self._table = np.array(
-            [[law.factors(c, closed=fits) for c in (resistance, 0 * resistance)] for fits in (True, False)]
+            [[law.factors(c, closed=fits, stiffness=kp) for c, kp in motors] for fits in (True, False)]
         )
         self._nowhere: Mask = np.zeros(shape, dtype=bool)
         self._held, self._open = self._nowhere, self._nowhere
