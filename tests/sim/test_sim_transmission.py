@@ -105,8 +105,10 @@ def coupled(of: TransmissionLaw, *state: float, stiffness: float = 0.0) -> list[
     """
     *now, resistance = (np.array([[value]]) for value in state)
     couplings = Couplings(of, resistance, np.array([[stiffness]]))
-    torque, _ = couplings.couple(*now)
-    own_speed, moving = (couplings.motor_speed(np.full((1, 1), speed)) for speed in (0.0, 1.0))
+    torque, _ = couplings.couple(np.stack(now))
+    own_speed, moving = np.empty((1, 1)), np.empty((1, 1))
+    couplings.follow(np.zeros((1, 1)), own_speed)
+    couplings.follow(np.ones((1, 1)), moving)
     parts = torque, couplings.inertia, own_speed, moving - own_speed
     return [float(part[0, 0]) for part in parts]
 

@@ -8,7 +8,7 @@ after each step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import mujoco
@@ -243,7 +243,7 @@ class StepLaws:
 
 
 def rollout(
-    batch: Batch, laws: StepLaws, control: FloatArray, spec: int, recorded: Sequence[str]
+    batch: Batch, laws: StepLaws, control: FloatArray, spec: int, recorded: Mapping[str, int]
 ) -> dict[str, FloatArray]:
     """Advance as ``Batch.rollout`` does, with laws before each step.
 
@@ -252,14 +252,16 @@ def rollout(
         laws: Their laws.
         control: What acts at each step, (N, S, size of ``spec``).
         spec: The state components that it sets.
-        recorded: MjData fields to return.
+        recorded: MjData fields to return, and the steps from one record to the next.
 
     Returns:
-        These fields after each step, (N, S, ...) each.
+        These fields after steps every, 2 every, ..., (N, S // every, ...) each.
     """
     count, steps, _ = control.shape
     fields = {name: batch.bind(name) for name in recorded}
-    record = {name: np.empty((count, steps, *field.shape[1:])) for name, field in fields.items()}
+    record = {
+        name: np.empty((count, steps // recorded[name], *field.shape[1:])) for name, field in fields.items()
+    }
     ctrl, applied = batch.bind("ctrl"), batch.bind("qfrc_applied")
     nu = ctrl.shape[1]
     pushed = bool(spec & int(mujoco.mjtState.mjSTATE_QFRC_APPLIED))
@@ -275,8 +277,10 @@ def rollout(
             batch.step()
             laws.follow()
             for name, field in fields.items():
-                record[name][:, step] = field
-                laws.report(name, record[name][:, step])
+                index, between = divmod(step + 1, recorded[name])
+                if not between:
+                    record[name][:, index - 1] = field
+                    laws.report(name, record[name][:, index - 1])
     return record
 
 

@@ -95,17 +95,16 @@ class Transmissions:
         names = self.names = list(given[TRANSMISSION_STIFFNESS])
         actuator = self.actuator = [element_id(model, "actuator", name) for name in names]
         joint = model.actuator_trnid[actuator, 0]
+        # Transmissions with the encoder at the motor, (B,), and where their joints have positions and speeds.
         turned = {name for name, _ in values.get(ENCODER_AT_MOTOR, ())}
-        at_motor = [k for k, j in enumerate(joint) if model.joint(int(j)).name in turned]
+        self._turned = np.array([model.joint(int(j)).name in turned for j in joint])
+        self.at_motor = bool(self._turned.any())
         dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
         self._actuator, self._dof, self._place = as_slice(actuator), as_slice(dof), as_slice(place)
-        # Transmissions with the encoder at the motor, and where their joints have positions and speeds.
-        self._turned = as_slice(at_motor)
         self._reported = {
-            "qpos": as_slice([place[k] for k in at_motor]),
-            "qvel": as_slice([dof[k] for k in at_motor]),
+            name: as_slice(np.array(of)[self._turned].tolist())
+            for name, of in (("qpos", place), ("qvel", dof))
         }
-        self.at_motor = bool(at_motor)
         self._qpos, self._qvel = outputs("qpos"), outputs("qvel")
         self._control, self._torque, self._qacc = outputs("ctrl"), outputs("qfrc_actuator"), outputs("qacc")
         self._gain, self._bias, self._range = (fields.get(name) for name in _FIELDS)
@@ -134,7 +133,7 @@ class Transmissions:
             link_inertia=np.maximum(whole - rotor, 1e-6 * whole),
             step_s=float(model.opt.timestep),
         )
-        self._gear = np.array(model.actuator_gear[actuator, 0])
+        self._gear = np.tile(model.actuator_gear[actuator, 0], (shape[0], 1))
         self._limited = np.array(model.actuator_forcelimited[actuator], dtype=bool)
         self._any_limited = bool(self._limited.any())
         self._control_range = np.where(
@@ -146,7 +145,9 @@ class Transmissions:
             never = np.full(shape[0], np.inf)
             self._free_speed = np.stack([known.get(name, never) for name in names], axis=1)
         self._bounded = bool(np.isfinite(self._control_range).any())
-        self.angle, self.speed = np.zeros(shape), np.zeros(shape)
+        # Deflection, motor's speed, link's speed and motor's torque.
+        self._state = np.zeros((4, *shape))
+        self.angle, self.speed = np.zeros(shape), self._state[1]
         # The torque that the transmissions pass.
         self._passed = np.zeros(shape)
         self.fresh: Mask = np.ones(shape[0], dtype=bool)
@@ -167,13 +168,12 @@ class Transmissions:
         at = self._actuator
         self._own = self._gain[:, at, 0].copy(), self._bias[:, at, :3].copy(), self._range[:, at].copy()
         gain, bias, limits = self._own
-        ends = np.sort(self._gear[:, None] * limits, axis=-1)
+        ends = np.sort(self._gear[..., None] * limits, axis=-1)
         ends[:, ~self._limited] = -np.inf, np.inf
         self._least, self._most = (np.ascontiguousarray(ends[..., k]) for k in (0, 1))
         self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
         self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
-        own = np.zeros_like(self._per_position)
-        own[:, self._turned] = self._per_position[:, self._turned]
+        own = np.where(self._turned, self._per_position, 0.0)
         self._couplings = Couplings(self.law, self._resistance, own)
         self._write_motors(np.zeros(len(self.fresh), dtype=bool))
 
@@ -218,10 +218,11 @@ class Transmissions:
         """
         rows, link = self.fresh[:, None], self._qvel[:, self._dof]
         read = self._qpos[:, self._place].copy()
-        self.speed = np.where(rows, link, self.speed)
-        self.angle = np.where(rows, read, self.angle)
-        torque, held = self._motors(read, served)
-        acting = torque - (self._resistance if held is None else np.where(held, 0.0, self._resistance)) * link
+        np.copyto(self.speed, link, where=rows)
+        np.copyto(self.angle, read, where=rows)
+        held = self._drive(read, served)
+        lost = self._resistance if held is None else np.where(held, 0.0, self._resistance)
+        acting = self._state[3] - lost * link
         self._write_motors(np.zeros_like(self.fresh))
         # Members that go on pass the torque of their last step.
         self._bias[:, self._actuator, 0] = np.where(rows, acting, self._passed) / self._gear
@@ -234,7 +235,7 @@ class Transmissions:
                 self._qpos[:, at] = np.where(rows, there, self._qpos[:, at])
                 bent = self._bent(forward)
             bent[:, motors] = read[:, motors] - self._qpos[:, at]
-        self.angle = np.where(rows, self._qpos[:, self._place] + bent, self.angle)
+        np.copyto(self.angle, self._qpos[:, self._place] + bent, where=rows)
         self.fresh[:] = False
         self._write_motors(self.fresh)
 
@@ -262,46 +263,52 @@ class Transmissions:
         Args:
             served: Places in B of servos whose firmware has just written their constant efforts.
         """
-        link = self._qpos[:, self._place].copy()
-        torque, held = self._motors(link, served)
-        self._passed, changed = self._couplings.couple(
-            self.angle - link, self.speed, self._qvel[:, self._dof], torque, held
-        )
+        # Operations on parts of rows cost more than a copy.
+        link, state = self._qpos[:, self._place].copy(), self._state
+        held = self._drive(link, served)
+        np.subtract(self.angle, link, out=state[0])
+        state[2] = self._qvel[:, self._dof]
+        self._passed, changed = self._couplings.couple(state, held)
         self._bias[:, self._actuator, 0] = self._passed / self._gear
         if changed:
             self._put_inertia(self._couplings.inertia)
         self._moves = True
 
-    def _motors(self, link: FloatArray, served: list[int]) -> tuple[FloatArray, Mask | None]:
-        """Return torques of the motors, (N, B), and where they are at their limits; None for nowhere.
+    def _drive(self, link: FloatArray, served: list[int]) -> Mask | None:
+        """Put the motors' torques into the state; return where they are at their limits, (N, B).
 
-        They are those at standstill, before what the motors lose with their speeds, or the limits.
+        The torques are those at standstill, before what the motors lose with their speeds, or the limits.
 
         Args:
             link: Positions of the links, (N, B).
             served: As in :meth:`write`.
+
+        Returns:
+            None for nowhere.
         """
         if served:
             efforts = self._bias[:, [self.actuator[k] for k in served], 0]
-            self._constant[:, served] = self._gear[served] * efforts
-        control = self._control[:, self._actuator]
+            self._constant[:, served] = self._gear[:, served] * efforts
+        control = self._control[:, self._actuator].copy()
         if self._bounded:
             low, high = self._control_range
             control = np.minimum(np.maximum(control, low), high)
-        read = link
-        if self.at_motor:
-            read = link.copy()
-            read[:, self._turned] = self.angle[:, self._turned]
-        torque = self._per_control * control + self._constant - self._per_position * read
+        read = np.where(self._turned, self.angle, link) if self.at_motor else link
+        torque = self._state[3]
+        np.multiply(self._per_control, control, out=torque)
+        torque += self._constant
+        torque -= self._per_position * read
         if not self._any_limited:
-            return torque, None
+            return None
         least, most = self._limits()
-        acting = torque - self._resistance * self.speed
+        acting = self._resistance * self.speed
+        np.subtract(torque, acting, out=acting)
         able = np.minimum(np.maximum(acting, least), most)
-        beyond = able != acting
+        beyond: Mask = able != acting
         if not np.count_nonzero(beyond):
-            return torque, None
-        return np.where(beyond, able, torque), beyond
+            return None
+        np.copyto(torque, able, where=beyond)
+        return beyond
 
     def _limits(self) -> tuple[FloatArray, FloatArray]:
         """Return the least and largest torque of the motors at their speeds, (N, B) each."""
@@ -312,5 +319,5 @@ class Transmissions:
     def follow(self) -> None:
         """Move the rotors by the step that the engine has done."""
         if self._moves:
-            self.speed = self._couplings.motor_speed(self._qvel[:, self._dof])
-            self.angle = self.angle + self.law.step_s * self.speed
+            self._couplings.follow(self._qvel[:, self._dof].copy(), self.speed)
+            self.angle += self.law.step_s * self.speed
