@@ -450,6 +450,20 @@ def test_a_member_does_not_feel_that_another_begins_anew(tmp_path: Path) -> None
     assert np.abs(one[1, 12:] - other[1, 12:]).max() > 1e-2
 
 
+@pytest.mark.parametrize("more", [(), (AT_MOTOR,)], ids=["at link", "at motor"])
+def test_reported_speeds_are_those_of_reported_positions(
+    tmp_path: Path, more: tuple[tuple[str, str, float], ...]
+) -> None:
+    """A step moves a position by the speed at its end, of the link or of the motor, in an encoder's scale."""
+    laws = [known(*law) for law in (*more, ("encoder_scale", "shoulder", 1.1))]
+    members = sprung(tmp_path, 1, SERVO, "shoulder", *laws)
+    members.set_state(np.full(2, 0.1), np.zeros(2))
+    position, velocity = members.advance(swing(200, 2), every=1)
+    np.testing.assert_allclose(np.diff(position[0], axis=0) / 0.002, velocity[0, 1:], atol=1e-9)
+    np.testing.assert_array_equal(members.velocity, velocity[:, -1])
+    assert np.ptp(velocity[0, :, 0]) > 1.0
+
+
 def test_gains_that_the_host_sends_act_at_the_motor(tmp_path: Path) -> None:
     """Without gains the arm falls; with them again it moves as before."""
     members = sprung(tmp_path)
