@@ -489,6 +489,14 @@ def rotor(least: float) -> Parameter:
     )  # fmt: skip
 
 
+def searched_place() -> Parameter:
+    """Return the place of an encoder, which is searched."""
+    return Parameter(
+        name="place", kind="encoder_at_motor", elements=("shoulder",), unit="-", nominal=1.0, low=0.0,
+        high=1.0, scale="linear",
+    )  # fmt: skip
+
+
 STIFF = ("transmission_stiffness", "shoulder", 100.0)
 
 
@@ -513,7 +521,8 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             r"spring that 'elbow' does not have; add .*kind:",
         ),
         (SERVO, space(AT_MOTOR), r"'shoulder' has no elastic transmission.*add transmission_stiffness"),
-        (SERVO, space(STIFF, (*AT_MOTOR[:2], 2.0)), r"is 2, and where.*`known: true`"),
+        (SERVO, space(STIFF, searched_place()), r"is searched, and the place.*`known: true`"),
+        (SERVO, space(STIFF, (*AT_MOTOR[:2], 2.0)), r"is 2, and the place.*`known: true`"),
         (SERVO.replace("implicitfast", "RK4"), space(STIFF), r"RK4 changes the torque of a.*Euler"),
         (
             SERVO.replace('kv="1"', 'kv="1" armature="0.01"'),
@@ -531,7 +540,7 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             r"2 actuators \('shoulder', 'elbow'\).*one",
         ),
     ],
-    ids="no rotor,rotor of 0,play,effort,no spring,rigid,no fact,RK4,own armature,joint limit,two".split(","),
+    ids="bare,rotor of 0,play,effort,no spring,rigid,searched,no fact,RK4,own rotor,limit,two".split(","),
 )
 def test_what_cannot_be_is_refused(text: str, parameters: ParameterSpace, message: str) -> None:
     """With what is allowed, and what to do."""

@@ -93,10 +93,10 @@ def check_transmissions(model: Any, space: ParameterSpace) -> None:
 
 def _check_encoder(p: Parameter, sprung: Collection[str]) -> None:
     if not p.known or p.nominal != 1.0:
+        given = f"{p.nominal:g}" if p.known else "searched"
         raise ConfigurationError(
-            f"parameter {p.name!r} ({p.kind}) is {f'{p.nominal:g}' if p.known else 'searched'}, and where an "
-            "encoder is is a fact; write `known: true` for encoders at the motor, leave it out for those at "
-            "the link"
+            f"parameter {p.name!r} ({p.kind}) is {given}, and the place of an encoder is a fact; "
+            "write `known: true` for encoders at the motor, leave it out for those at the link"
         )
     for joint in p.elements:
         if joint not in sprung:
@@ -166,6 +166,7 @@ TRANSMISSION_KINDS = (
         writes=(),
         along="the reported position is the motor's, before the elastic transmission; `known: true` only",
         apply=None,
+        # No MJCF says it: the entry itself does.
         baseline=lambda m, i: 1.0,
         usable=one_dof_joint,
         scale="linear",
