@@ -4,8 +4,9 @@ A law of `deal_hw.sim` (friction by speed or load, the effort by speed, a servo'
 transmission) writes the model's fields before each step. A row is one robot, law and number of members:
 `ratio` is the processor time of a rollout with the law on all joints over that of one without, in one thread.
 They run in turns, and the median of the turns' ratios counts, with its quartiles, so that other work
-changes little. Robots begin in their default pose, under random set-points, which change every ten steps. A
-law that changes the motion changes the time of contacts and friction, too, so a ratio below 1 can be.
+changes little. `engine_ratio` is the part of it within MuJoCo's steps. A law that changes the motion changes
+the time of contacts and friction, too: the solver needs more iterations for joints that rattle, and a ratio
+below 1 can be. Robots begin in their default pose, under random set-points, which change every ten steps.
 
 .venv/bin/python tools/measure_laws.py --out laws.json
 .venv/bin/python tools/measure_laws.py --robots so101 --laws transmission --members 16 --steps 400
@@ -16,15 +17,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from fakes.law_robots import known
 from measuring import Rows, parser
+from mujoco.batch import Batch
 
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robots.registry import robot_description
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel, load_model
+from deal_hw.sim.parameters import find_kind
 
 ROBOTS = ("so101", "go2")
 SPRING = {"transmission_stiffness": 1000.0, "transmission_damping": 1.0}
@@ -35,6 +39,7 @@ LAWS: dict[str, dict[str, float]] = {
     "firmware": {"servo_dead_zone": 0.01},
     "transmission": SPRING,
     "play": SPRING | {"transmission_play": 0.01},
+    "encoder-at-motor": SPRING | {"encoder_at_motor": 1.0},
 }
 """Parameters of each law: kinds and their values."""
 EVERY = 10
@@ -47,7 +52,7 @@ def members_with(robot: RobotModel, law: str, count: int) -> ServoBatch:
     found = [
         known(kind, element, value)
         for kind, value in LAWS.get(law, {}).items()
-        for element in names[not kind.startswith("dof_")]
+        for element in names[find_kind(kind).element == "actuator"]
     ]
     if not found:
         found = [known("dof_damping", names[0][0], float(robot.model.dof_damping[robot.qvel[0]]))]
@@ -78,6 +83,21 @@ def rollout(members: ServoBatch, steps: int) -> Callable[[], float]:
     return run
 
 
+def within_steps(run: Callable[[], float]) -> float:
+    """Return the processor time of a run with laws within MuJoCo's steps [s]."""
+    spent, step = 0.0, Batch.step
+
+    def timed(batch: Batch) -> None:
+        nonlocal spent
+        began = time.process_time()
+        step(batch)
+        spent += time.process_time() - began
+
+    with mock.patch.object(Batch, "step", timed):
+        run()
+    return spent
+
+
 def measure(robot: str, laws: list[str], count: int, steps: int, repeats: int) -> list[dict[str, Any]]:
     """Return a row of each law."""
     model = load_model(robot_description(robot))
@@ -86,12 +106,15 @@ def measure(robot: str, laws: list[str], count: int, steps: int, repeats: int) -
         run()
     spent = np.array([[run() for run in runs.values()] for _ in range(repeats)])
     ratios = spent[:, 1:] / spent[:, :1]
+    engine = np.array([[within_steps(runs[law]) for law in laws] for _ in range(repeats)])
+    engine_ratios = np.median(engine / spent[:, :1], axis=0)
     rows = []
-    for law, ratio, mine in zip(laws, ratios.T, spent[:, 1:].T, strict=True):
+    for law, ratio, within, mine in zip(laws, ratios.T, engine_ratios, spent[:, 1:].T, strict=True):
         row: dict[str, Any] = {"robot": robot, "law": law, "joints": len(model.description.joint_names)}
         row |= {"members": count, "steps": steps, "repeats": repeats}
         low, middle, high = np.percentile(ratio, (25, 50, 75))
         row |= {"ratio": round(middle, 3), "ratio_quartiles": [round(low, 3), round(high, 3)]}
+        row["engine_ratio"] = round(float(within), 3)
         row["bare_us_per_step"] = round(float(np.median(spent[:, 0])) / steps * 1e6, 2)
         row["law_us_per_step"] = round(float(np.median(mine - spent[:, 0])) / steps * 1e6, 2)
         rows.append(row)

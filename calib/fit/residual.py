@@ -27,7 +27,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.calib.fit.command_delays import with_command_delays
-from deal_hw.sim.parameters.laws import SERVO_RESOLUTION
+from deal_hw.sim.parameters.laws import SERVO_PUNCH, SERVO_RESOLUTION
 from deal_hw.types import FloatArray
 
 PARAMETER_STEP = 1e-4
@@ -40,6 +40,10 @@ them better than a derivative."""
 COUNTED_PARAMETER_STEP = 2e-2
 """The same where servos read their joints in counts. The motion follows these in jumps: a smaller step passes
 too few of them, and its effect is chance."""
+
+JUMP_PARAMETER_STEP, JUMP_POSITION_STEP, JUMP_VELOCITY_STEP = 5e-3, 1e-4, 1e-2
+"""The steps where a servo's effort jumps at the edge of its dead zone. It does so at the beginning of a
+physics step; a smaller change moves hardly any jump to another one."""
 
 NOISE_FREE_PARAMETER_STEP = 1e-5
 """The same for noise-free states, where no noise hides a secant's error."""
@@ -179,7 +183,11 @@ class Shooting:
         self.start_information = [1 / d.prior_std**2 for d in self.data]
         self._parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
-        if any(p.kind == SERVO_RESOLUTION for p in problem.space.parameters):
+        kinds = {p.kind for p in problem.space.parameters}
+        if SERVO_PUNCH in kinds:
+            self._parameter_step = JUMP_PARAMETER_STEP
+            self._state_step = np.repeat([JUMP_POSITION_STEP, JUMP_VELOCITY_STEP], C)
+        if SERVO_RESOLUTION in kinds:
             self._parameter_step = COUNTED_PARAMETER_STEP
         if self.contacts:
             self._parameter_step = CONTACT_PARAMETER_STEP

@@ -85,7 +85,11 @@ class ActuatorLaws:
         self.restart(self._held())
 
     def restart(self, command: npt.ArrayLike) -> None:
-        """Begin anew, with a command that has acted for long: servos' set-points or motors' efforts, (A,)."""
+        """Begin anew, with a command that has acted for long: servos' set-points or motors' efforts, (A,).
+
+        Positions in the data are those at the encoders. Where one is at the motor, behind an elastic
+        transmission, the first step puts the link to where its load bends that.
+        """
         held = np.asarray(command, dtype=float)[None]
         self._path[:] = held[:, None]
         self._memory = self._commands.memory(held)
@@ -117,8 +121,11 @@ class ActuatorLaws:
     def reported(self) -> FloatArray:
         """Return the positions of all hinges and slides as their encoders report them, (J,) [rad or m]."""
         one = self._one_dof
-        true = self._data.qpos[self._model.jnt_qposadr[one]]
-        return np.asarray(self._scale[one] * true + self._bias[one])
+        measured = self._data.qpos.copy()
+        if self._laws is not None:
+            self._laws.report("qpos", measured[None])
+        at = self._model.jnt_qposadr[one]
+        return np.asarray(self._scale[one] * measured[at] + self._bias[one])
 
     @property
     def _one_dof(self) -> npt.NDArray[np.intp]:

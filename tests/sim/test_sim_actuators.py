@@ -55,6 +55,15 @@ def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> Flo
         },
         {
             "transmission_stiffness": 60.0,
+            "transmission_play": 0.01,
+            "encoder_at_motor": 1.0,
+            "servo_dead_zone": 0.02,
+            "dof_friction_load": 0.1,
+            "encoder_scale": 1.1,
+            "encoder_bias": 0.05,
+        },
+        {
+            "transmission_stiffness": 60.0,
             "servo_dead_zone": 0.02,
             "servo_punch": 0.1,
             "dof_friction_load": 0.1,

@@ -54,12 +54,14 @@ TWO_BODIES = """
 class Loop:
     """One model in a loop of mj_step with the laws between the steps."""
 
-    def __init__(self, text: str, **kinds: float) -> None:
+    def __init__(self, text: str, *, at_motor: bool = False, **kinds: float) -> None:
         model = self.model = mujoco.MjModel.from_xml_string(text)
         self.data = mujoco.MjData(model)
         name = model.actuator(0).name
         take_constant_torques(model, [name])
         values = {f"transmission_{kind}": [(name, np.array([value]))] for kind, value in kinds.items()}
+        if at_motor:
+            values["encoder_at_motor"] = [(name, np.ones(1))]
         laws = StepLaws.of(ModelFields(model, model), lambda field: getattr(self.data, field)[None], values)
         assert laws is not None and laws.transmissions is not None
         self._laws, self.rotor = laws, laws.transmissions
@@ -83,7 +85,8 @@ class Loop:
 
 def plate(stiffness: float, step: float = 0.002, integrator: str = "implicitfast", **kinds: float) -> Loop:
     """Return the plate without gravity."""
-    return Loop(PLATE.format(step=step, integrator=integrator), stiffness=stiffness, **kinds)
+    text = PLATE.format(step=step, integrator=integrator)
+    return Loop(text, at_motor=False, stiffness=stiffness, **kinds)
 
 
 def law(**parts: float) -> TransmissionLaw:
@@ -92,17 +95,20 @@ def law(**parts: float) -> TransmissionLaw:
     return TransmissionLaw(**{name: np.array([[value]]) for name, value in every.items()}, step_s=0.001)
 
 
-def coupled(of: TransmissionLaw, *state: float) -> list[float]:
+def coupled(of: TransmissionLaw, *state: float, stiffness: float = 0.0) -> list[float]:
     """Return torque, inertia, own speed and the share that follows, of one joint.
 
     Args:
         of: Its law.
         state: Deflection, speeds of the motor and of the link, torque, and what it loses with the speed.
+        stiffness: What it loses with the motor's angle.
     """
     *now, resistance = (np.array([[value]]) for value in state)
-    couplings = Couplings(of, resistance)
-    torque, _ = couplings.couple(*now)
-    own_speed, moving = (couplings.motor_speed(np.full((1, 1), speed)) for speed in (0.0, 1.0))
+    couplings = Couplings(of, resistance, np.array([[stiffness]]))
+    torque, _ = couplings.couple(np.stack(now))
+    own_speed, moving = np.empty((1, 1)), np.empty((1, 1))
+    couplings.follow(np.zeros((1, 1)), own_speed)
+    couplings.follow(np.ones((1, 1)), moving)
     parts = torque, couplings.inertia, own_speed, moving - own_speed
     return [float(part[0, 0]) for part in parts]
 
@@ -133,6 +139,12 @@ def test_a_motors_resistance_by_hand() -> None:
 def test_a_strong_damper_does_not_ring() -> None:
     """200 N·m·s/rad on a rotor of 20: a tenth counts at the beginning, and it stops in one step."""
     assert coupled(law(), 0.0, 1.0, 0.0, 0.0, 200.0) == pytest.approx([0.0, 0.0, 0.0, 0.0])
+
+
+def test_a_stiff_servo_at_the_motor_by_hand() -> None:
+    """4e4 N·m/rad on 0.02 kg·m²: twice what 1 ms bears, so half a step of it, 20 N·m·s/rad, is at the end."""
+    speed = (20.0 * 1.0 + 2.0 - 3.0) / (20.0 + 4e4 * 0.001 / 2)
+    assert coupled(law(), 0.03, 1.0, 0.5, 2.0, 0.0, stiffness=4e4) == pytest.approx([3.0, 0.0, speed, 0.0])
 
 
 def test_a_stiff_spring_adds_the_rotor_to_the_link() -> None:
@@ -240,11 +252,12 @@ def test_motion_is_that_of_two_bodies(
     assert np.all(np.abs(found - expected).max(axis=1) < tolerance * np.ptp(expected, axis=1))
 
 
+@pytest.mark.parametrize("at_motor", [False, True], ids=["link", "motor"])
 @pytest.mark.parametrize("limit", [10.0, 0.7])
-def test_a_servo_reads_the_link_and_is_damped_at_the_motor(limit: float) -> None:
-    """Two bodies: 15 N·m/rad of the link's error, 0.6 N·m·s/rad of the motor's speed, then the limit."""
+def test_a_servo_reads_its_encoder_and_is_damped_at_the_motor(limit: float, at_motor: bool) -> None:
+    """Two bodies: 15 N·m/rad of the error, 0.6 N·m·s/rad of the motor's speed, then the limit."""
     text = POSITION.format(kp=15).replace("-2 2", f"-{limit} {limit}")
-    loop = Loop(PENDULUM.format(actuator=text), stiffness=60.0, damping=0.05)
+    loop = Loop(PENDULUM.format(actuator=text), at_motor=at_motor, stiffness=60.0, damping=0.05)
     model = mujoco.MjModel.from_xml_string(TWO_BODIES.format(stiffness=60, damping=0.05, low=0, high=0))
     data = mujoco.MjData(model)
     found, expected = np.empty((2, 800)), np.empty((2, 800))
@@ -252,7 +265,7 @@ def test_a_servo_reads_the_link_and_is_damped_at_the_motor(limit: float) -> None
         goal = 0.5 * math.sin(2 * math.pi * 1.2 * 0.002 * step)
         loop.step(goal)
         for _ in range(20):
-            torque = 15 * (goal - data.qpos[0]) - 0.6 * data.qvel[1]
+            torque = 15 * (goal - data.qpos[int(at_motor)]) - 0.6 * data.qvel[1]
             data.ctrl[0] = min(max(torque, -limit), limit)
             mujoco.mj_step(model, data)
         found[:, step] = loop.data.qpos[0], loop.rotor.angle[0, 0]
@@ -261,17 +274,42 @@ def test_a_servo_reads_the_link_and_is_damped_at_the_motor(limit: float) -> None
     assert np.ptp(expected[1] - expected[0]) > 0.01
 
 
+@settings(max_examples=30, deadline=None)
+@given(
+    stiffness=st.floats(1.0, 1e5),
+    gain=st.floats(1.0, 1e5),
+    rotor=st.sampled_from([1e-5, 1e-3, 0.02]),
+    play=st.sampled_from([0.0, 0.05]),
+)
+def test_no_servo_that_reads_its_motor_blows_up(
+    stiffness: float, gain: float, rotor: float, play: float
+) -> None:
+    """From 0.2 rad beside its goal without any damping, the motor never goes much further from it."""
+    text = PENDULUM.replace("0.02", f"{rotor}", 1).format(actuator=POSITION.format(kp=gain))
+    text = text.replace('kv="0.6" forcerange="-2 2"', "")
+    loop = Loop(text, at_motor=True, stiffness=stiffness, play=play)
+    loop.data.qpos[0] = 0.2
+    for _ in range(300):
+        loop.step(0.0)
+        assert abs(loop.rotor.angle[0, 0]) < 0.5
+
+
 def test_a_servo_with_firmware_moves_a_stiff_transmission_as_the_rigid_one(tmp_path: Path) -> None:
-    """Dead zone and punch behind a gear that turns the other way, an effort limit, an encoder's scale."""
+    """Dead zone and punch behind a gear that turns the other way, an effort limit, an encoder's scale.
+
+    Whether the encoder is at the link or at the motor, which move as one.
+    """
     firmware = {"servo_dead_zone": 0.02, "servo_punch": 0.2, "encoder_scale": 1.1}
     kinds = [known(kind, "shoulder", value) for kind, value in firmware.items()]
+    spring, at_motor = known("transmission_stiffness", "shoulder", 1e7), known(*AT_MOTOR)
     model, path = robot(tmp_path, GEARED), 1.2 * swing(500, 1)
     runs = []
-    for law in ([], kinds, [*kinds, known("transmission_stiffness", "shoulder", 1e7)]):
+    for law in ([], kinds, [*kinds, spring], [*kinds, spring, at_motor]):
         members = batch(model, *law)
         members.set_state(np.array([0.2]), np.zeros(1))
         runs.append(members.advance(path, every=1)[0])
     np.testing.assert_allclose(runs[2], runs[1], atol=1e-3)
+    np.testing.assert_allclose(runs[3], runs[1], atol=1e-3)
     assert np.abs(runs[1] - runs[0]).max() > 0.02
 
 
@@ -301,6 +339,38 @@ def test_a_stiff_transmission_moves_as_the_rigid_model(tmp_path: Path, stiffness
     np.testing.assert_allclose(runs[1], runs[0], atol=3e-4)
 
 
+AT_MOTOR = ("encoder_at_motor", "shoulder", 1.0)
+
+
+@pytest.mark.parametrize("firmware", [{}, {"servo_dead_zone": 0.02, "servo_punch": 0.1}], ids=["", "zone"])
+@pytest.mark.parametrize("play", [0.0, 0.02])
+def test_a_window_begins_where_the_motor_was_measured(
+    tmp_path: Path, firmware: dict[str, float], play: float
+) -> None:
+    """A servo holds an arm of 0.7 kg: a state from its readings goes on, and its link hangs lower.
+
+    The load is that of the link's own position; it holds still from the first step on.
+    """
+    kinds = SPRING | {"transmission_play": play} | firmware
+    text = SERVO.replace('frictionloss="0.1"', "").replace('frictionloss="0.05"', "")
+    members = batch(
+        robot(tmp_path, text), known(*AT_MOTOR), *(known(k, "shoulder", v) for k, v in kinds.items())
+    )
+    link, goal = members.batch.bind("qpos"), np.array([0.6, 0.2])
+    members.set_state(goal, np.zeros(2))
+    members.advance(np.tile(goal, (1, 8000, 1)))
+    settled, at = members.position.copy(), link.copy()
+    members.set_state(settled[0], np.zeros(2))
+    np.testing.assert_array_equal(members.position, settled)
+    found, _ = members.advance(np.tile(goal, (1, 200, 1)), every=1)
+    np.testing.assert_allclose(found[0], np.tile(settled, (200, 1)), atol=2e-5)
+    np.testing.assert_allclose(link, at, atol=2e-5)
+    load = 9.81 * (
+        0.4 * 0.15 * math.sin(at[0, 0]) + 0.3 * (0.3 * math.sin(at[0, 0]) + 0.15 * math.sin(at.sum()))
+    )
+    assert settled[0, 0] - at[0, 0] == pytest.approx(load / 60 + play / 2, rel=1e-3)
+
+
 SPRING = {"transmission_stiffness": 60.0, "transmission_damping": 0.1, "transmission_play": 0.01}
 
 
@@ -313,10 +383,14 @@ def sprung(
     )
 
 
+@pytest.mark.parametrize("at_motor", [False, True], ids=["at link", "at motor"])
 @pytest.mark.parametrize(("text", "name"), [(SERVO, "shoulder"), (MOTOR, "wheel")], ids=["servo", "motor"])
-def test_a_window_does_not_depend_on_the_one_before(tmp_path: Path, text: str, name: str) -> None:
+def test_a_window_does_not_depend_on_the_one_before(
+    tmp_path: Path, text: str, name: str, at_motor: bool
+) -> None:
     """States that are set anew have rotors that follow from them, also in windows and with new values."""
-    members = sprung(tmp_path, 2, text, name)
+    more = [known("encoder_at_motor", name, 1.0)] if at_motor else []
+    members = sprung(tmp_path, 2, text, name, *more)
     joints = 2 if text == SERVO else 1
     start, path = np.full(joints, 0.2), np.repeat(swing(200, joints), 2, axis=0)
     runs = []
@@ -352,21 +426,42 @@ def periods(members: ServoBatch, again: int | None = None) -> FloatArray:
     return np.stack(found, axis=1)
 
 
-def test_rotors_go_on_from_one_control_period_to_the_next(tmp_path: Path) -> None:
+@pytest.mark.parametrize("more", [(), (AT_MOTOR,)], ids=["at link", "at motor"])
+def test_rotors_go_on_from_one_control_period_to_the_next(
+    tmp_path: Path, more: tuple[tuple[str, str, float], ...]
+) -> None:
     """Twenty periods of a closed loop are one path."""
-    whole = sprung(tmp_path, 2)
+    laws = [known(*law) for law in more]
+    whole = sprung(tmp_path, 2, SERVO, "shoulder", *laws)
     whole.set_state(np.full(2, 0.1), np.zeros(2))
     path = np.repeat(swing(200, 2)[:, ::10], 10, axis=1)
     expected, _ = whole.advance(np.repeat(path, 2, axis=0), every=10)
-    np.testing.assert_allclose(periods(sprung(tmp_path, 2)), expected, atol=1e-12)
+    members = sprung(tmp_path, 2, SERVO, "shoulder", *laws)
+    np.testing.assert_allclose(periods(members), expected, atol=1e-12)
+    np.testing.assert_array_equal(members.position, expected[:, -1])
 
 
 def test_a_member_does_not_feel_that_another_begins_anew(tmp_path: Path) -> None:
     """With friction by load, which takes the torques of the step before, and a firmware."""
-    laws = known("dof_friction_load", "shoulder", 0.1), known("servo_dead_zone", "shoulder", 0.02)
+    kinds = {"dof_friction_load": 0.1, "servo_dead_zone": 0.02, "encoder_at_motor": 1.0}
+    laws = [known(kind, "shoulder", value) for kind, value in kinds.items()]
     one, other = (periods(sprung(tmp_path, 2, SERVO, "shoulder", *laws), again) for again in (None, 12))
     np.testing.assert_array_equal(one[0], other[0])
     assert np.abs(one[1, 12:] - other[1, 12:]).max() > 1e-2
+
+
+@pytest.mark.parametrize("more", [(), (AT_MOTOR,)], ids=["at link", "at motor"])
+def test_reported_speeds_are_those_of_reported_positions(
+    tmp_path: Path, more: tuple[tuple[str, str, float], ...]
+) -> None:
+    """A step moves a position by the speed at its end, of the link or of the motor, in an encoder's scale."""
+    laws = [known(*law) for law in (*more, ("encoder_scale", "shoulder", 1.1))]
+    members = sprung(tmp_path, 1, SERVO, "shoulder", *laws)
+    members.set_state(np.full(2, 0.1), np.zeros(2))
+    position, velocity = members.advance(swing(200, 2), every=1)
+    np.testing.assert_allclose(np.diff(position[0], axis=0) / 0.002, velocity[0, 1:], atol=1e-9)
+    np.testing.assert_array_equal(members.velocity, velocity[:, -1])
+    assert np.ptp(velocity[0, :, 0]) > 1.0
 
 
 def test_gains_that_the_host_sends_act_at_the_motor(tmp_path: Path) -> None:
@@ -394,6 +489,14 @@ def rotor(least: float) -> Parameter:
     )  # fmt: skip
 
 
+def searched_place() -> Parameter:
+    """Return the place of an encoder, which is searched."""
+    return Parameter(
+        name="place", kind="encoder_at_motor", elements=("shoulder",), unit="-", nominal=1.0, low=0.0,
+        high=1.0, scale="linear",
+    )  # fmt: skip
+
+
 STIFF = ("transmission_stiffness", "shoulder", 100.0)
 
 
@@ -417,6 +520,9 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             space(("transmission_play", "elbow", 1.0)),
             r"spring that 'elbow' does not have; add .*kind:",
         ),
+        (SERVO, space(AT_MOTOR), r"'shoulder' has no elastic transmission.*add transmission_stiffness"),
+        (SERVO, space(STIFF, searched_place()), r"is searched, and the place.*`known: true`"),
+        (SERVO, space(STIFF, (*AT_MOTOR[:2], 2.0)), r"is 2, and the place.*`known: true`"),
         (SERVO.replace("implicitfast", "RK4"), space(STIFF), r"RK4 changes the torque of a.*Euler"),
         (
             SERVO.replace('kv="1"', 'kv="1" armature="0.01"'),
@@ -434,7 +540,7 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             r"2 actuators \('shoulder', 'elbow'\).*one",
         ),
     ],
-    ids="no rotor,rotor of 0,play,effort,no spring,RK4,own armature,joint limit,two".split(","),
+    ids="bare,rotor of 0,play,effort,no spring,rigid,searched,no fact,RK4,own rotor,limit,two".split(","),
 )
 def test_what_cannot_be_is_refused(text: str, parameters: ParameterSpace, message: str) -> None:
     """With what is allowed, and what to do."""

@@ -16,6 +16,7 @@ def test_a_row_for_each_law() -> None:
         assert (row["joints"], row["members"], row["steps"], row["repeats"]) == (6, 2, 20, 3)
         low, high = row["ratio_quartiles"]
         assert 0 < low <= row["ratio"] <= high and row["bare_us_per_step"] > 0
+        assert row["engine_ratio"] > 0
 
 
 @pytest.mark.parametrize("law", LAWS)

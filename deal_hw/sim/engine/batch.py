@@ -2,7 +2,8 @@
 
 States are tangent coordinates (see the module of this name), (N, C): for a floating base its position,
 rotation vector and then the joints, for a fixed base the joints alone. Velocities are MuJoCo's, in the same
-order. Joint positions and speeds are as the robot reports them: with each member's encoder bias and scale.
+order. Joint positions and speeds are as the robot reports them: with each member's encoder bias and scale,
+and of the motor where its encoder is there.
 """
 
 from __future__ import annotations
@@ -312,12 +313,20 @@ class ServoBatch:
     @property
     def position(self) -> FloatArray:
         """Present tangent coordinates, (N, C), around the identity."""
-        return self._tangent_coordinates(self._qpos, None)
+        return self._tangent_coordinates(self._measured("qpos", self._qpos), None)
 
     @property
     def velocity(self) -> FloatArray:
         """Present velocities, (N, C)."""
-        return self._reported_speed(np.asarray(self._qvel[:, self._dof]))
+        return self._reported_speed(np.asarray(self._measured("qvel", self._qvel)[:, self._dof]))
+
+    def _measured(self, name: str, values: FloatArray) -> FloatArray:
+        """Return a field of the state, (N, ...), with rotors where encoders measure these."""
+        if self._steps is None:
+            return values
+        found = values.copy()
+        self._steps.report(name, found)
+        return found
 
     def _reported_speed(self, velocity: FloatArray) -> FloatArray:
         """Return velocities, (N, ..., C), as the encoders report them."""

@@ -139,12 +139,12 @@ class MujocoEngine:
                 record = self.batch.rollout(
                     control.shape[1], control=control, control_spec=spec, record=tuple(recorded)
                 )
+                record = {name: record[name][:, every - 1 :: every] for name, every in recorded.items()}
             else:
-                record = rollout(self.batch, laws, control, spec, tuple(recorded))
+                record = rollout(self.batch, laws, control, spec, recorded)
         except mujoco.FatalError as err:
             raise CalibrationError(f"the model cannot be simulated: {short(str(err))}") from err
-        read = {name: record[name][:, every - 1 :: every] for name, every in recorded.items()}
-        return read, self._warnings() > before
+        return record, self._warnings() > before
 
     def _warnings(self) -> npt.NDArray[np.int64]:
         # Counters of (bad qpos, bad qvel, bad qacc, bad ctrl): an increase is a divergence, after which

@@ -90,11 +90,18 @@ class ServoFirmware:
         """Write the model's own constant efforts where the law has written."""
         self._bias[:, self._rows, 0] = self.offset
 
-    def write(self) -> None:
-        """Write constant efforts for the next step, from the controls and positions at its beginning."""
+    def write(self, measured: FloatArray | None = None) -> None:
+        """Write constant efforts for the next step, from the controls and positions at its beginning.
+
+        Args:
+            measured: The state's positions as encoders measure them, (N, nq); by default those of the joints.
+        """
         goal = self._control[:, self._rows]
         if self._limited:
             goal = np.clip(goal, *self.control_range)
-        goal, position = goal * self.per_ctrl, self._qpos[:, self._columns]
+        goal, position = (
+            goal * self.per_ctrl,
+            (self._qpos if measured is None else measured)[:, self._columns],
+        )
         missing = self.law.acting_error(goal, position, self._stiffness) - (goal - position)
         self._bias[:, self._rows, 0] = self.offset + self._push * missing

@@ -8,7 +8,7 @@ after each step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 import mujoco
@@ -80,7 +80,7 @@ class StepLaws:
         self._served: list[int] = []
         if transmissions is not None and firmware is not None:
             self._served = np.flatnonzero(np.isin(transmissions.actuator, firmware.actuator)).tolist()
-        self._qvel = outputs("qvel")
+        self._qpos, self._qvel = outputs("qpos"), outputs("qvel")
         if self.loaded:
             # Outputs that are bound are copied after every step.
             self._bias, self._torque = outputs("qfrc_bias"), outputs("qfrc_actuator")
@@ -192,12 +192,32 @@ class StepLaws:
             forward: Computes the torques of all simulations.
         """
         rotors = self.transmissions
-        if rotors is not None and (self.loaded or rotors.fresh.any()):
-            rotors.begin(forward, self.firmware)
-        elif self.loaded:
-            if self.firmware is not None:
-                self.firmware.write()
+        if not self.loaded and (rotors is None or not rotors.fresh.any()):
+            return
+        if self.firmware is not None:
+            self.firmware.write(self._measured())
+        if rotors is None:
             forward()
+        else:
+            rotors.begin(forward, self._served)
+
+    def _measured(self) -> FloatArray | None:
+        """Return positions as encoders measure them, (N, nq); None where all are at the joints."""
+        if self.transmissions is None or not self.transmissions.at_motor:
+            return None
+        found = self._qpos.copy()
+        self.transmissions.report("qpos", found)
+        return found
+
+    def report(self, name: str, values: FloatArray) -> None:
+        """Put what encoders at motors measure into a field of MjData.
+
+        Args:
+            name: The field; those other than "qpos" and "qvel" stay.
+            values: Its values now, (N, ...).
+        """
+        if self.transmissions is not None:
+            self.transmissions.report(name, values)
 
     def write(self) -> None:
         """Write friction, limits and the servos' efforts for the next step, whose controls are set."""
@@ -212,7 +232,7 @@ class StepLaws:
             low, high = effort_range(self._qvel[:, self._driven] * self._turns, self._stall, self._free_speed)
             self._range[:, self._actuator, 0], self._range[:, self._actuator, 1] = low, high
         if self.firmware is not None:
-            self.firmware.write()
+            self.firmware.write(self._measured())
         if self.transmissions is not None:
             self.transmissions.write(self._served)
 
@@ -223,7 +243,7 @@ class StepLaws:
 
 
 def rollout(
-    batch: Batch, laws: StepLaws, control: FloatArray, spec: int, recorded: Sequence[str]
+    batch: Batch, laws: StepLaws, control: FloatArray, spec: int, recorded: Mapping[str, int]
 ) -> dict[str, FloatArray]:
     """Advance as ``Batch.rollout`` does, with laws before each step.
 
@@ -232,14 +252,16 @@ def rollout(
         laws: Their laws.
         control: What acts at each step, (N, S, size of ``spec``).
         spec: The state components that it sets.
-        recorded: MjData fields to return.
+        recorded: MjData fields to return, and the steps from one record to the next.
 
     Returns:
-        These fields after each step, (N, S, ...) each.
+        These fields after steps every, 2 every, ..., (N, S // every, ...) each.
     """
     count, steps, _ = control.shape
     fields = {name: batch.bind(name) for name in recorded}
-    record = {name: np.empty((count, steps, *field.shape[1:])) for name, field in fields.items()}
+    record = {
+        name: np.empty((count, steps // recorded[name], *field.shape[1:])) for name, field in fields.items()
+    }
     ctrl, applied = batch.bind("ctrl"), batch.bind("qfrc_applied")
     nu = ctrl.shape[1]
     pushed = bool(spec & int(mujoco.mjtState.mjSTATE_QFRC_APPLIED))
@@ -255,7 +277,10 @@ def rollout(
             batch.step()
             laws.follow()
             for name, field in fields.items():
-                record[name][:, step] = field
+                index, between = divmod(step + 1, recorded[name])
+                if not between:
+                    record[name][:, index - 1] = field
+                    laws.report(name, record[name][:, index - 1])
     return record
 
 

@@ -2,9 +2,9 @@
 
 A joint's ``dof_armature`` is the rotor's inertia. It is taken out of the model, and the rotor gets an angle
 and a speed of its own. The actuator's gains, constant effort and limit give the motor's torque: from the
-position of the link, where the encoder is, and the speed of the motor. In the model the actuator is a
-constant torque, which is written before each step, and the armature is what the link feels of the rotor.
-So ``qfrc_actuator`` is what the transmission passes.
+position where the encoder is, of the link or of the motor, and the speed of the motor. In the model the
+actuator is a constant torque, which is written before each step, and the armature is what the link feels of
+the rotor. So ``qfrc_actuator`` is what the transmission passes.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy.typing as npt
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName
-from deal_hw.sim.engine.servo_firmware import ServoFirmware
 from deal_hw.sim.laws.motor import effort_range
 from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
 from deal_hw.sim.parameters.laws import FREE_SPEED
 from deal_hw.sim.parameters.transmission import (
+    ENCODER_AT_MOTOR,
     TRANSMISSION_DAMPING,
     TRANSMISSION_PLAY,
     TRANSMISSION_STIFFNESS,
@@ -33,7 +33,13 @@ from deal_hw.types import FloatArray
 
 Outputs = Callable[[str], FloatArray]
 
+Mask = npt.NDArray[np.bool_]
+
 _FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
+
+_SETTLING = 2
+"""Times that a link's start position follows from its load there. Each leaves a share of the error: what the
+load changes with the position over the transmission's stiffness, 1/65 for the arm of the tests."""
 
 
 def check_engine(space: ParameterSpace, engine: EngineName) -> None:
@@ -74,6 +80,7 @@ class Transmissions:
     Attributes:
         names: Names of the actuators, B of them.
         actuator: Their numbers.
+        at_motor: Whether any encoder is at the motor.
         fresh: Whether the rotors of a member follow from its state at the next beginning, (N,).
         angle: Angles of the motors, (N, B) [rad or m].
         speed: Their speeds, (N, B) [rad/s or m/s].
@@ -88,8 +95,16 @@ class Transmissions:
         names = self.names = list(given[TRANSMISSION_STIFFNESS])
         actuator = self.actuator = [element_id(model, "actuator", name) for name in names]
         joint = model.actuator_trnid[actuator, 0]
+        # Transmissions with the encoder at the motor, (B,), and where their joints have positions and speeds.
+        turned = {name for name, _ in values.get(ENCODER_AT_MOTOR, ())}
+        self._turned = np.array([model.joint(int(j)).name in turned for j in joint])
+        self.at_motor = bool(self._turned.any())
         dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
         self._actuator, self._dof, self._place = as_slice(actuator), as_slice(dof), as_slice(place)
+        self._reported = {
+            name: as_slice(np.array(of)[self._turned].tolist())
+            for name, of in (("qpos", place), ("qvel", dof))
+        }
         self._qpos, self._qvel = outputs("qpos"), outputs("qvel")
         self._control, self._torque, self._qacc = outputs("ctrl"), outputs("qfrc_actuator"), outputs("qacc")
         self._gain, self._bias, self._range = (fields.get(name) for name in _FIELDS)
@@ -118,7 +133,7 @@ class Transmissions:
             link_inertia=np.maximum(whole - rotor, 1e-6 * whole),
             step_s=float(model.opt.timestep),
         )
-        self._gear = np.array(model.actuator_gear[actuator, 0])
+        self._gear = np.tile(model.actuator_gear[actuator, 0], (shape[0], 1))
         self._limited = np.array(model.actuator_forcelimited[actuator], dtype=bool)
         self._any_limited = bool(self._limited.any())
         self._control_range = np.where(
@@ -130,10 +145,12 @@ class Transmissions:
             never = np.full(shape[0], np.inf)
             self._free_speed = np.stack([known.get(name, never) for name in names], axis=1)
         self._bounded = bool(np.isfinite(self._control_range).any())
-        self.angle, self.speed = np.zeros(shape), np.zeros(shape)
+        # Deflection, motor's speed, link's speed and motor's torque.
+        self._state = np.zeros((4, *shape))
+        self.angle, self.speed = np.zeros(shape), self._state[1]
         # The torque that the transmissions pass.
         self._passed = np.zeros(shape)
-        self.fresh: npt.NDArray[np.bool_] = np.ones(shape[0], dtype=bool)
+        self.fresh: Mask = np.ones(shape[0], dtype=bool)
         self._moves = False
         self.read_sent()
 
@@ -151,12 +168,13 @@ class Transmissions:
         at = self._actuator
         self._own = self._gain[:, at, 0].copy(), self._bias[:, at, :3].copy(), self._range[:, at].copy()
         gain, bias, limits = self._own
-        ends = np.sort(self._gear[:, None] * limits, axis=-1)
+        ends = np.sort(self._gear[..., None] * limits, axis=-1)
         ends[:, ~self._limited] = -np.inf, np.inf
         self._least, self._most = (np.ascontiguousarray(ends[..., k]) for k in (0, 1))
         self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
         self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
-        self._couplings = Couplings(self.law, self._resistance)
+        own = np.where(self._turned, self._per_position, 0.0)
+        self._couplings = Couplings(self.law, self._resistance, own)
         self._write_motors(np.zeros(len(self.fresh), dtype=bool))
 
     def restore_sent(self) -> None:
@@ -187,29 +205,57 @@ class Transmissions:
         if self._simple_dof:
             self._derived[:, self._simple_dof] = self._alone + inertia[:, self._simple]
 
-    def begin(self, forward: Callable[[], None], firmware: ServoFirmware | None) -> None:
+    def begin(self, forward: Callable[[], None], served: list[int]) -> None:
         """Set the states of fresh rotors: they move with their links, and their springs pass what is needed.
 
-        That is the motor's torque less what accelerates the rotor together with its link.
+        That is the motor's torque less what accelerates the rotor together with its link. The position in
+        the state is that of the encoder. Where it is the motor's, the link gets its own one: that at which
+        its load bends the spring as much.
 
         Args:
             forward: Computes torques and accelerations of all simulations.
-            firmware: What servos make of their errors; None for servos without such a law.
+            served: Places in B of servos whose firmware has just written their constant efforts.
         """
-        rows = self.fresh
-        self._write_motors(rows)
-        if firmware is not None:
-            firmware.write()
-            # Members that go on pass the torque of their last step.
-            sent = self._bias[:, self._actuator, 0]
-            self._bias[:, self._actuator, 0] = np.where(rows[:, None], sent, self._passed / self._gear)
+        rows, link = self.fresh[:, None], self._qvel[:, self._dof]
+        read = self._qpos[:, self._place].copy()
+        np.copyto(self.speed, link, where=rows)
+        np.copyto(self.angle, read, where=rows)
+        held = self._drive(read, served)
+        lost = self._resistance if held is None else np.where(held, 0.0, self._resistance)
+        acting = self._state[3] - lost * link
+        self._write_motors(np.zeros_like(self.fresh))
+        # Members that go on pass the torque of their last step.
+        self._bias[:, self._actuator, 0] = np.where(rows, acting, self._passed) / self._gear
+        self._put_inertia(np.where(rows, self.law.inertia, self._couplings.inertia))
+        bent = self._bent(forward)
+        if self.at_motor:
+            at, motors = self._reported["qpos"], self._turned
+            for _ in range(_SETTLING):
+                there = read[:, motors] - bent[:, motors]
+                self._qpos[:, at] = np.where(rows, there, self._qpos[:, at])
+                bent = self._bent(forward)
+            bent[:, motors] = read[:, motors] - self._qpos[:, at]
+        np.copyto(self.angle, self._qpos[:, self._place] + bent, where=rows)
+        self.fresh[:] = False
+        self._write_motors(self.fresh)
+
+    def _bent(self, forward: Callable[[], None]) -> FloatArray:
+        """Return how far transmissions bend that move rotors and links as one in this state, (N, B)."""
         forward()
-        link = self._qvel[:, self._dof]
-        passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
-        self.speed[rows] = link[rows]
-        self.angle[rows] = (self._qpos[:, self._place] + self.law.deflection(passed))[rows]
-        rows[:] = False
-        self._write_motors(rows)
+        return self.law.deflection(self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof])
+
+    def report(self, name: str, values: FloatArray) -> None:
+        """Put what encoders at motors measure into positions or speeds of the simulations.
+
+        Args:
+            name: The field of MjData, "qpos" or "qvel"; others stay.
+            values: Its values, (N, ...).
+        """
+        if self.at_motor and name in self._reported:
+            at = self._reported[name]
+            motors = (self.angle if name == "qpos" else self.speed)[:, self._turned]
+            # A fresh state is as it was set: by what the encoder has measured.
+            values[:, at] = np.where(self.fresh[:, None], values[:, at], motors)
 
     def write(self, served: list[int]) -> None:
         """Write torques and inertias for the next step, whose controls are set.
@@ -217,32 +263,52 @@ class Transmissions:
         Args:
             served: Places in B of servos whose firmware has just written their constant efforts.
         """
-        if served:
-            efforts = self._bias[:, [self.actuator[k] for k in served], 0]
-            self._constant[:, served] = self._gear[served] * efforts
-        link = self._qpos[:, self._place].copy()
-        control = self._control[:, self._actuator]
-        if self._bounded:
-            low, high = self._control_range
-            control = np.minimum(np.maximum(control, low), high)
-        torque = self._per_control * control + self._constant - self._per_position * link
-        beyond = None
-        if self._any_limited:
-            least, most = self._limits()
-            acting = torque - self._resistance * self.speed
-            able = np.minimum(np.maximum(acting, least), most)
-            beyond = able != acting
-            if np.count_nonzero(beyond):
-                torque = np.where(beyond, able, torque)
-            else:
-                beyond = None
-        self._passed, changed = self._couplings.couple(
-            self.angle - link, self.speed, self._qvel[:, self._dof], torque, beyond
-        )
+        # Operations on parts of rows cost more than a copy.
+        link, state = self._qpos[:, self._place].copy(), self._state
+        held = self._drive(link, served)
+        np.subtract(self.angle, link, out=state[0])
+        state[2] = self._qvel[:, self._dof]
+        self._passed, changed = self._couplings.couple(state, held)
         self._bias[:, self._actuator, 0] = self._passed / self._gear
         if changed:
             self._put_inertia(self._couplings.inertia)
         self._moves = True
+
+    def _drive(self, link: FloatArray, served: list[int]) -> Mask | None:
+        """Put the motors' torques into the state; return where they are at their limits, (N, B).
+
+        The torques are those at standstill, before what the motors lose with their speeds, or the limits.
+
+        Args:
+            link: Positions of the links, (N, B).
+            served: As in :meth:`write`.
+
+        Returns:
+            None for nowhere.
+        """
+        if served:
+            efforts = self._bias[:, [self.actuator[k] for k in served], 0]
+            self._constant[:, served] = self._gear[:, served] * efforts
+        control = self._control[:, self._actuator].copy()
+        if self._bounded:
+            low, high = self._control_range
+            control = np.minimum(np.maximum(control, low), high)
+        read = np.where(self._turned, self.angle, link) if self.at_motor else link
+        torque = self._state[3]
+        np.multiply(self._per_control, control, out=torque)
+        torque += self._constant
+        torque -= self._per_position * read
+        if not self._any_limited:
+            return None
+        least, most = self._limits()
+        acting = self._resistance * self.speed
+        np.subtract(torque, acting, out=acting)
+        able = np.minimum(np.maximum(acting, least), most)
+        beyond: Mask = able != acting
+        if not np.count_nonzero(beyond):
+            return None
+        np.copyto(torque, able, where=beyond)
+        return beyond
 
     def _limits(self) -> tuple[FloatArray, FloatArray]:
         """Return the least and largest torque of the motors at their speeds, (N, B) each."""
@@ -253,5 +319,5 @@ class Transmissions:
     def follow(self) -> None:
         """Move the rotors by the step that the engine has done."""
         if self._moves:
-            self.speed = self._couplings.motor_speed(self._qvel[:, self._dof])
-            self.angle = self.angle + self.law.step_s * self.speed
+            self._couplings.follow(self._qvel[:, self._dof].copy(), self.speed)
+            self.angle += self.law.step_s * self.speed

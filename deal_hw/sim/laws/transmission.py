@@ -28,6 +28,10 @@ ring, and at least that of the spring, so that stiff ones move as the rigid mode
 stable. A mode loses speed by the factor ``(1 - (1 - share) x) / (1 + share x + share' a)``, where share' is
 the spring's. The roots of a step lie within the unit circle for
 ``4 + 2 (2 share - 1) x + (2 share' - 1) a > 0``.
+
+A servo whose encoder is at the motor pulls the rotor to its goal as a spring of its stiffness kp does. That
+spring has a share of its own, ``max(0, 1 - J / (h² kp))``, so that a light rotor and a stiff servo do not
+blow up either.
 """
 
 from __future__ import annotations
@@ -85,11 +89,6 @@ class TransmissionLaw:
         """Half of the gap's width, (N, B) [rad or m]."""
         return self.play / 2
 
-    @cached_property
-    def gapless(self) -> bool:
-        """Whether no joint has play."""
-        return not np.any(self.play)
-
     def deflection(self, torque: FloatArray) -> FloatArray:
         """Return motor less link angles at which the transmissions at rest pass torques, (N, B)."""
         return np.asarray(torque / self.stiffness + np.sign(torque) * self.half_play)
@@ -104,24 +103,28 @@ class TransmissionLaw:
         least = np.maximum(0.5, self.spring_share)
         return np.asarray(np.maximum(least, 1 - 1 / np.maximum(lost, 1.0)))
 
-    def factors(self, resistance: FloatArray, *, closed: bool) -> FloatArray:
-        """Return what a step multiplies by where the gaps are closed, or where they are open, (12, N, B).
+    def factors(self, resistance: FloatArray, stiffness: FloatArray | float = 0.0) -> FloatArray:
+        """Return what a step multiplies by, (12, N, B).
 
         Args:
             resistance: What the motor's torque loses with its speed, c, (N, B) [N·m·s/rad or N·s/m].
-            closed: Whether the gaps are closed.
+            stiffness: What it loses with its angle, kp, (N, B) [N·m/rad or N/m]; 0 for an encoder at the
+                link.
 
         Returns:
-            Factors of deflection, motor's speed, link's speed and motor's torque in the motor's speed at the
-            end, if the link stands still there, and the same four in the torque on the link. Then the share
-            of the link's speed at the end that adds to the motor's, and the inertia that the link has beside
-            its own. Last those of the motor's speed and torque in the speed at the end of a free rotor.
+            Where the gap is closed, factors of deflection, motor's speed, link's speed and motor's torque in
+            the motor's speed at the end, if the link stands still there, and the same four in the torque on
+            the link. Then the share of the link's speed at the end that adds to the motor's, and the inertia
+            that the link has beside its own. Last those of the motor's speed and torque in the speed at the
+            end of a free rotor, as it is within the gap.
         """
         end = self.damper_share(resistance)
-        carried, none = self.inertia / self.step_s, np.zeros_like(resistance)
-        rotor, kept = carried + end * resistance, carried - (1 - end) * resistance
-        spring, damper = (self.stiffness, (1 - end) * self.damping) if closed else (none, none)
-        grip = spring * self.ahead_s + (end * self.damping if closed else none)
+        carried = self.inertia / self.step_s
+        turned = self.step_s**2 * stiffness / self.inertia
+        held = stiffness * self.step_s * (1 - 1 / np.maximum(turned, 1.0))
+        rotor, kept = carried + end * resistance + held, carried - (1 - end) * resistance
+        spring, damper = self.stiffness, (1 - end) * self.damping
+        grip = spring * self.ahead_s + end * self.damping
         both = rotor + grip
         follows, left = grip / both, rotor / both
         # The part of grip that the rotor's speed does not follow.
@@ -134,84 +137,82 @@ class TransmissionLaw:
 class Couplings:
     """What links feel of their motors in each step, and how the motors follow them.
 
-    A joint is in one of four cases: its gap is closed or open, and its motor has a torque that falls with its
-    speed or one at its limit. The factors of all cases are computed once; those that act change with them.
+    A joint's gap is closed or open, and its motor has a torque that falls with its speed or one at its limit.
+    The factors of both motors are computed once; those that act change with them.
 
     Args:
         law: The transmissions.
         resistance: What the motors' torques lose with their speeds, c, (N, B) [N·m·s/rad or N·s/m].
+        stiffness: What they lose with the motors' own angles, (N, B) [N·m/rad or N/m]; 0 for encoders at the
+            links.
 
     Attributes:
         inertia: What the links have beside their own, (N, B) [kg·m² or kg].
     """
 
-    def __init__(self, law: TransmissionLaw, resistance: FloatArray) -> None:
+    def __init__(
+        self, law: TransmissionLaw, resistance: FloatArray, stiffness: FloatArray | float = 0.0
+    ) -> None:
         self._law, shape = law, resistance.shape
-        # By gap (closed, open), then by motor (free, held).
-        self._table = np.array(
-            [[law.factors(c, closed=fits) for c in (resistance, 0 * resistance)] for fits in (True, False)]
-        )
+        self._gapless = not np.any(law.play)
+        self._motors = law.factors(resistance, stiffness), law.factors(0 * resistance)
         self._nowhere: Mask = np.zeros(shape, dtype=bool)
-        self._held, self._open = self._nowhere, self._nowhere
-        # Deflection, motor's speed, link's speed and motor's torque; then their products, and their sums.
-        self._state, self._products = np.zeros((4, *shape)), np.zeros((2, 4, *shape))
-        self._sums = np.zeros((2, *shape))
-        self._act(self._table[0, 0])
+        self._held = self._nowhere
+        self._products, self._sums = np.zeros((2, 4, *shape)), np.zeros((2, *shape))
+        # Speeds of the motors at the end, if the links stand still there.
+        self._own = self._sums[0]
+        self._act(self._motors[0])
 
-    def couple(
-        self,
-        deflection: FloatArray,
-        motor_speed: FloatArray,
-        link_speed: FloatArray,
-        torque: FloatArray,
-        held: Mask | None = None,
-    ) -> tuple[FloatArray, bool]:
+    def couple(self, state: FloatArray, held: Mask | None = None) -> tuple[FloatArray, bool]:
         """Return the constant torque on the links during the next step, and whether `inertia` changed.
 
         The torque is overwritten in the next step.
 
         Args:
-            deflection: Motor less link angle, (N, B) [rad or m].
-            motor_speed: Speed of the motor, (N, B) [rad/s or m/s].
-            link_speed: Speed of the link, (N, B) [rad/s or m/s].
-            torque: Torque of the motor: at standstill, t, or the limit where it is held, (N, B) [N·m or N].
+            state: Motor less link angle [rad or m], which is overwritten by what exceeds the gap; speed of
+                the motor, speed of the link [rad/s or m/s]; torque of the motor [N·m or N]: at standstill, t,
+                or the limit where it is held; (4, N, B).
             held: Where the motor is at its limit, (N, B); None for nowhere.
         """
-        held, opened = self._nowhere if held is None else held, self._nowhere
+        held = self._nowhere if held is None else held
         changed = held is not self._held and bool(np.count_nonzero(held != self._held))
-        if not self._law.gapless:
-            # Whether the gap is closed is asked of a rotor that nothing holds yet.
-            kept, free = self._free
-            if changed:
-                kept, free = np.where(held, self._table[0, 1, 10:], self._table[0, 0, 10:])
-            half = self._law.half_play
-            reached = deflection + self._law.ahead_s * (kept * motor_speed + free * torque - link_speed)
-            opened = np.abs(reached) < half
-            deflection = deflection - np.copysign(half, reached)
-            changed = changed or bool(np.count_nonzero(opened != self._open))
         if changed:
-            self._held, self._open = held, opened
-            self._act(self._choose(held, opened))
-        state = self._state
-        state[0], state[1], state[2], state[3] = deflection, motor_speed, link_speed, torque
+            self._held = held
+            self._act(np.where(held, self._motors[1], self._motors[0]))
+        if self._gapless:
+            self._add(state)
+            return self._sums[1], changed
+        deflection, motor_speed, link_speed, torque = state
+        # Whether the gap is closed is asked of a rotor that nothing holds yet.
+        free = self._kept * motor_speed
+        free += self._free * torque
+        reached = free - link_speed
+        reached *= self._law.ahead_s
+        reached += deflection
+        half = self._law.half_play
+        closed = np.abs(reached) >= half
+        deflection -= np.copysign(half, reached)
+        self._add(state)
+        np.copyto(free, self._sums[0], where=closed)
+        self._own = free
+        # As numbers: a product with truth values costs three times as much. Gaps open and close all the time.
+        fits = closed.astype(float)
+        self._sums[1] *= fits
+        self._follows, self.inertia = self._fits[0] * fits, self._fits[1] * fits
+        return self._sums[1], True
+
+    def _add(self, state: FloatArray) -> None:
+        """Add what closed gaps make of a state, (4, N, B)."""
         np.multiply(self._factors, state, out=self._products)
         np.add.reduce(self._products, axis=1, out=self._sums)
-        return self._sums[1], changed
 
-    def motor_speed(self, link_speed: FloatArray) -> FloatArray:
-        """Return the motors' speeds at the end of the step from those of the links, (N, B)."""
-        return np.asarray(self._sums[0] + self._follows * link_speed)
-
-    def _choose(self, held: Mask, opened: Mask) -> FloatArray:
-        """Return the factors of joints whose motors are held and whose gaps are open there, (12, N, B)."""
-        closed, apart = self._table
-        if not np.count_nonzero(opened):
-            return np.asarray(np.where(held, closed[1], closed[0]))
-        if np.count_nonzero(held):
-            closed, apart = (np.where(held, rows[1], rows[0])[None] for rows in (closed, apart))
-        return np.asarray(np.where(opened, apart[0], closed[0]))
+    def follow(self, link_speed: FloatArray, motor_speed: FloatArray) -> None:
+        """Write the motors' speeds at the end of the step into the last argument, (N, B) each."""
+        np.multiply(self._follows, link_speed, out=motor_speed)
+        motor_speed += self._own
 
     def _act(self, factors: FloatArray) -> None:
         """Let factors act, (12, N, B)."""
         self._factors = factors[:8].reshape(self._products.shape)
-        self._follows, self.inertia, self._free = factors[8], factors[9], factors[10:]
+        self._fits, self._kept, self._free = factors[8:10], factors[10], factors[11]
+        self._follows, self.inertia = self._fits

@@ -38,9 +38,10 @@ FRICTION_KINDS: Mapping[str, Sequence[str]] = MappingProxyType(
 """Kinds that are laws of friction, and the coefficients of `FrictionLaw` that they set."""
 
 SERVO_RESOLUTION = "servo_resolution"
+SERVO_PUNCH = "servo_punch"
 
 SERVO_LAW_KINDS: Mapping[str, str] = MappingProxyType(
-    {SERVO_RESOLUTION: "resolution", "servo_dead_zone": "dead_zone", "servo_punch": "punch"}
+    {SERVO_RESOLUTION: "resolution", "servo_dead_zone": "dead_zone", SERVO_PUNCH: "punch"}
 )
 """Kinds that are laws of a servo's firmware, and the parts of `ServoLaw` that they set."""
 
@@ -217,7 +218,7 @@ LAW_KINDS = (
         spread=0.03,
     ),
     Kind(
-        name="servo_punch",
+        name=SERVO_PUNCH,
         element="actuator",
         quantity="servo_punch",
         unit="N·m",

@@ -1,16 +1,19 @@
 """Parameter kinds of elastic transmissions: stiffness, damping and play between a motor and its link.
 
+One is a fact: which side of the transmission the encoder measures.
+
 Their equations are in :mod:`deal_hw.sim.laws.transmission`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any, Final
 
 import numpy as np
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.kind import Kind, joint_of, one_dof_joint
@@ -19,6 +22,7 @@ from deal_hw.sim.parameters.laws import check_integrator
 TRANSMISSION_STIFFNESS: Final = "transmission_stiffness"
 TRANSMISSION_DAMPING: Final = "transmission_damping"
 TRANSMISSION_PLAY: Final = "transmission_play"
+ENCODER_AT_MOTOR: Final = "encoder_at_motor"
 
 _EFFORTS = ("effort_gain", "effort_bias", "effort_delay", "effort_noise")
 
@@ -63,6 +67,13 @@ def check_transmissions(model: Any, space: ParameterSpace) -> None:
                         f"parameter {p.name!r} ({kind}) is of a spring that {name!r} does not have; add "
                         f"{{kind: {TRANSMISSION_STIFFNESS}, elements: {name}, known: 1e5}} or its value"
                     )
+    joints = {
+        model.joint(joint_of(model, element_id(model, "actuator", e))).name
+        for kind, e in kinds
+        if kind == TRANSMISSION_STIFFNESS
+    }
+    for p in (p for p in space.parameters if p.kind == ENCODER_AT_MOTOR):
+        _check_encoder(p, joints)
     for name in (e for kind, e in kinds if kind == TRANSMISSION_STIFFNESS):
         first = kinds[TRANSMISSION_STIFFNESS, name].name
         if ("servo_play", name) in kinds:
@@ -78,6 +89,21 @@ def check_transmissions(model: Any, space: ParameterSpace) -> None:
                     f"parameter {kinds[other, joint.name].name!r} ({other}) is of the motor's effort, and "
                     f"the joint {joint.name!r} has the torque of its transmission ({first!r}); leave one out"
                 )
+
+
+def _check_encoder(p: Parameter, sprung: Collection[str]) -> None:
+    if not p.known or p.nominal != 1.0:
+        given = f"{p.nominal:g}" if p.known else "searched"
+        raise ConfigurationError(
+            f"parameter {p.name!r} ({p.kind}) is {given}, and the place of an encoder is a fact; "
+            "write `known: true` for encoders at the motor, leave it out for those at the link"
+        )
+    for joint in p.elements:
+        if joint not in sprung:
+            raise ConfigurationError(
+                f"parameter {p.name!r} ({p.kind}): {joint!r} has no elastic transmission, so it turns as its "
+                f"motor does; add {TRANSMISSION_STIFFNESS} of its actuator, or leave this out"
+            )
 
 
 def _check_rotor(model: Any, joint: Any, armature: Any, spring: str) -> None:
@@ -131,5 +157,18 @@ TRANSMISSION_KINDS = (
         usable=_elastic,
         scale="linear",
         spread=0.05,
+    ),
+    Kind(
+        name=ENCODER_AT_MOTOR,
+        element="joint",
+        quantity="encoder_at_motor",
+        unit="-",
+        writes=(),
+        along="the reported position is the motor's, before the elastic transmission; `known: true` only",
+        apply=None,
+        # No MJCF says it: the entry itself does.
+        baseline=lambda m, i: 1.0,
+        usable=one_dof_joint,
+        scale="linear",
     ),
 )
