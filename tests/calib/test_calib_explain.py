@@ -30,7 +30,7 @@ from deal_hw.calib.validation.explanations import PLAY as PLAY_LAW
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
 from deal_hw.parameters import ParameterSpace
-from deal_hw.testing.plain_robots import PLAY, Fault
+from deal_hw.testing.plain_faults import PLAY, Fault
 from deal_hw.workflows.calibration.run import calibrate_episodes
 
 
