@@ -477,8 +477,8 @@ BRIEF = OutputErrorFits(
         windows_s=(0.15, 0.3), compared_s=0.15, mismatch_s=0.2, first=Recipe(seconds=0.1), search_always=False
     )
 )
-"""Fits of predictions of a robot whose joints are not all held by servos. A pole that falls forgets in some
-0.3 s where it was: the time constant of 0.5 m is 0.2 s. In half of that friction shows little beside inertia."""
+"""Fits of predictions of a robot whose joints are not all held by servos. A pole that falls forgets where it
+was in some 0.3 s: the time constant of 0.5 m is 0.2 s. In less, friction shows little beside inertia."""
 
 FORCES = ("servo_stiffness", "servo_damping", "dof_frictionloss")
 """Kinds of parameters that scale with all forces."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2
@@ -25,6 +26,8 @@ from deal_hw.calib.validation.explanations import (
     SHAPES,
     Explanation,
     off_value,
+    one_sided,
+    sized,
     tried_value,
 )
 from deal_hw.calib.validation.signatures import Signature, whitened_changes
@@ -163,14 +166,35 @@ def _gains(
     seen = evidence(problem, refined, answered=False) if known is None else known()
     causes = [seen.gain([], group) for group in groups_of(seen.found)]
     at = problem, refined.theta, refined.latency_s, refined.shooting, refined.point
-    gains = screened_gains(seen, {each: screened(*at, each, more) for each, more in can.items()})
+    gains = {
+        each: screened_gain(seen, screened(*at, each, more), one_sided(problem, more))
+        for each, more in can.items()
+    }
     return gains, max(EVIDENCE, RIVAL * max(*causes, *gains.values()))
 
 
-def screened_gains(known: Evidence, laws: Mapping[Explanation, Signature]) -> dict[Explanation, float]:
-    """Return the held-out deviance that each explanation gains by its linearised effect alone."""
-    seen = dataclasses.replace(known, found=list(laws.values()))
-    return {each: seen.gain([], [law]) for each, law in laws.items()}
+def screened_gain(known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_]) -> float:
+    """Return the held-out deviance that an explanation gains by its linearised effect alone.
+
+    A dead zone below 0 explains what friction does, too, but no robot has one. Parameters that would have to
+    leave their range have no effect.
+
+    Args:
+        known: The evidence.
+        law: What its parameters do where they have an effect, n of them.
+        one_way: Which of them can only move in that direction, (n,).
+    """
+    kept = np.arange(len(one_way))
+    while len(kept):
+        mine = dataclasses.replace(law, columns=tuple(columns[..., kept] for columns in law.columns))
+        seen = dataclasses.replace(known, found=[mine])
+        # The residual is prediction minus measurement: a parameter moves against its coefficient.
+        moves = -seen.coefficients([mine])[len(known.prior) :]
+        left = kept[(moves > 0) | ~one_way[kept]]
+        if len(left) == len(kept):
+            return seen.gain([], [mine])
+        kept = left
+    return 0.0
 
 
 def screened(
@@ -196,7 +220,7 @@ def screened(
         more: Its parameters.
     """
     wide = problem.with_more(more)
-    sizes = [k for k, p in enumerate(more) if p.kind not in SHAPES]
+    sizes = sized(more)
     K, off = len(theta), np.array([off_value(p) for p in more])
     members = np.repeat(np.append(theta, off)[None], 1 + len(sizes), axis=0)
     for row, k in enumerate(sizes):
@@ -256,7 +280,8 @@ def _named(wide: WiderFit, of: Explanation) -> list[int]:
     if of is PLAY:
         found = wide.found
         return [int(k) for k in np.argsort(-found) if found[k] >= LEAST_PLAY * found.max() > 0]
-    sure = np.where([p.kind in SHAPES for p in wide.more], 0.0, np.abs(wide.significance()))
+    off = np.array([off_value(p) for p in wide.more])
+    sure = np.where([p.kind in SHAPES for p in wide.more], 0.0, np.abs(wide.significance(off)))
     sizes = [int(k) for k in np.argsort(-sure) if sure[k] > SURE]
     places = {e for k in sizes for e in wide.more[k].elements}
     shapes = [k for k, p in enumerate(wide.more) if p.kind in SHAPES and places & set(p.elements)]

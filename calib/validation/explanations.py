@@ -10,13 +10,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.validation.signatures import Cause
 from deal_hw.calib.validation.wider_models import MOST_FORCE, motion
+from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters import KIND_TABLE
-from deal_hw.sim.parameters.laws import STRIBECK_SPEED
+from deal_hw.sim.parameters.laws import FREE_SPEED, STRIBECK_SPEED
+from deal_hw.sim.parameters.sensor import ENCODER_SCALE
 from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
 
 MOST_PLAY = 0.5
@@ -30,6 +33,20 @@ FIRST_LAG_S = 0.005
 
 MOST_ASYMMETRY = 0.5
 """Largest share by which a motor does more to one side that is tried [-]."""
+
+MOST_DEAD_ZONE = 0.5
+"""Largest dead zone of a motor that is tried, as a share of its largest command [-]."""
+
+MOST_SERVO_DEAD_ZONE = 0.1
+"""The same of a servo [rad or m]. AX-12A: 0.0051 rad as it is delivered; HerkuleX: below 10 counts of 0.0057
+rad are recommended."""
+
+FREE_SPEEDS = (10.0, 1.0, 100.0)
+"""Free speed at which a fit begins, the least and the largest one, in rms speeds of the joint [-]. The
+largest one takes a hundredth of the effort at that speed."""
+
+MOST_SCALE = 1.5
+"""Largest factor by which an encoder is tried to report more or less [-]."""
 
 FIRST_SHARE = 0.3
 """Further friction at rest from which a fit begins, as a share of the friction in motion [-]."""
@@ -98,6 +115,13 @@ def _load(problem: Problem) -> list[Parameter]:
     return [Parameter.friction_by_load(name, (name,)) for name in driven]
 
 
+def _motor_load(problem: Problem) -> list[Parameter]:
+    return [
+        _parameter(problem, "dof_friction_motor", p.elements[0], p.nominal, 0.0, p.high)
+        for p in _load(problem)
+    ]
+
+
 def _lag(problem: Problem) -> list[Parameter]:
     if _searched(problem, "command_lag"):
         return []
@@ -118,6 +142,53 @@ def _motor(problem: Problem) -> list[Parameter]:
     names = problem.robot.actuator_names
     return [
         _parameter(problem, "command_asymmetry", name, 0.0, -MOST_ASYMMETRY, MOST_ASYMMETRY) for name in names
+    ]
+
+
+def _motor_dead_zone(problem: Problem) -> list[Parameter]:
+    if problem.robot.description.actuation != "motor" or _searched(problem, "command_dead_zone"):
+        return []
+    sent = np.max([np.max(np.abs(e.target), axis=0) for e in problem.episodes], axis=0)
+    return [
+        _parameter(problem, "command_dead_zone", name, 0.0, 0.0, MOST_DEAD_ZONE * float(most))
+        for name, most in zip(problem.robot.actuator_names, sent, strict=True)
+        if most > 0
+    ]
+
+
+def _servo_dead_zone(problem: Problem) -> list[Parameter]:
+    if any(_searched(problem, kind) for kind in ("servo_dead_zone", TRANSMISSION_STIFFNESS)):
+        return []
+    return [
+        _parameter(problem, "servo_dead_zone", name, 0.0, 0.0, MOST_SERVO_DEAD_ZONE)
+        for name in problem.robot.actuator_names
+        if _usable(problem, "servo_dead_zone", name)
+    ]
+
+
+def _free_speed(problem: Problem) -> list[Parameter]:
+    if _searched(problem, FREE_SPEED):
+        return []
+    facts, speeds = problem.robot.description, motion(problem)[0]
+    found = []
+    for name, joint in zip(problem.robot.actuator_names, facts.actuated, strict=True):
+        speed = float(speeds[facts.joint_names.index(joint)])
+        if speed > 0 and _usable(problem, FREE_SPEED, name):
+            first, low, high = (factor * speed for factor in FREE_SPEEDS)
+            found.append(_parameter(problem, FREE_SPEED, name, first, low, high, scale="log"))
+    return found
+
+
+def _scale(problem: Problem) -> list[Parameter]:
+    if _searched(problem, ENCODER_SCALE):
+        return []
+    facts = problem.robot.description
+    servos = facts.actuated if facts.actuation == "position" else ()
+    # In the loop of a servo a scale looks as other gains and inertias do.
+    return [
+        _parameter(problem, ENCODER_SCALE, name, 1.0, 1 / MOST_SCALE, MOST_SCALE, scale="log")
+        for name in facts.joint_names
+        if name not in servos
     ]
 
 
@@ -150,6 +221,15 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
     Explanation(
+        "friction that grows with the motor's torque",
+        "friction",
+        _motor_load,
+        "Dry friction grows with the torque of the motor, and not with that from outside. So it is in most "
+        "servos that were identified (BAM, model M6). That of MuJoCo is constant.",
+        "Free dof_friction_motor of {} (--parameters).",
+        "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
         "drives that lag",
         "drive",
         _lag,
@@ -165,6 +245,38 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Check the motor of {} and its drive, or free command_asymmetry there (--parameters).",
         "Check the motor and its drive. Until then use this result: it has the difference as {}.",
     ),
+    Explanation(
+        "motors with a dead zone",
+        "drive",
+        _motor_dead_zone,
+        "Small commands have no effect, and larger ones lose as much, as with a bridge that takes a voltage.",
+        "Free command_dead_zone of {} (--parameters).",
+        "Use this result: it has the zone as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "servos with a dead zone",
+        "drive",
+        _servo_dead_zone,
+        "The servo has no effort while its error is small, as its firmware or its electronics may want.",
+        "Make the dead zone of {} smaller in the servo, or free servo_dead_zone there (--parameters).",
+        "Use this result: it has the zone as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "effort that falls with speed",
+        "drive",
+        _free_speed,
+        "The motor is on a limited voltage: its largest effort falls with speed. That of MuJoCo is constant.",
+        "Free motor_free_speed of {} (--parameters).",
+        "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "encoders with another scale",
+        "scale",
+        _scale,
+        "The encoder reports more or less than the joint moves, as with a wrong number of counts a turn.",
+        "Check the counts a turn of {} in the column map, or free encoder_scale there (--parameters).",
+        "Correct the counts a turn. Until then use this result: it has the scale as {}.",
+    ),
 )
 """Candidates, those with the fewest parameters first."""
 
@@ -177,17 +289,50 @@ SHAPES = ("dof_stribeck_speed",)
 
 
 def off_value(p: Parameter) -> float:
-    """Return the value at which a parameter has no effect."""
-    return p.nominal if p.kind in SHAPES else 0.0
+    """Return the value at which a parameter has no effect, or the least in its range."""
+    if p.kind == FREE_SPEED:
+        return p.high
+    return p.nominal if p.kind in (*SHAPES, ENCODER_SCALE) else 0.0
+
+
+def sized(parameters: Sequence[Parameter]) -> list[int]:
+    """Return the indices of parameters that have an effect of their own."""
+    return [k for k, p in enumerate(parameters) if p.kind not in SHAPES]
+
+
+def one_sided(problem: Problem, parameters: Sequence[Parameter]) -> npt.NDArray[np.bool_]:
+    """Return which sized parameters have no effect at an end of their range, so that only one way is left."""
+    # A filter of the MJCF is no end: the robot's lag may be shorter.
+    free = () if problem.robot.filters is None else ("command_lag",)
+    return np.array(
+        [
+            parameters[k].kind not in free
+            and off_value(parameters[k]) in (parameters[k].low, parameters[k].high)
+            for k in sized(parameters)
+        ],
+        dtype=bool,
+    )
 
 
 def tried_value(p: Parameter) -> float:
     """Return a value with some effect."""
-    return p.nominal or TRIED * p.high
+    off = off_value(p)
+    return p.nominal if p.nominal != off else off + TRIED * (p.high - off)
 
 
 def _searched(problem: Problem, kind: str) -> bool:
     return any(p.kind == kind for p in problem.space.parameters)
+
+
+def _usable(problem: Problem, kind: str, element: str) -> bool:
+    """Return whether an element can have a parameter of a kind."""
+    of, model = KIND_TABLE[kind], problem.robot.model
+    try:
+        if of.usable is not None:
+            of.usable(model, getattr(model, of.element)(element).id, element)
+    except ConfigurationError:
+        return False
+    return True
 
 
 def _parameter(

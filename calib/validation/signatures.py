@@ -24,7 +24,18 @@ from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray
 
 Cause = Literal[
-    "friction", "backlash", "delay", "damping", "inertia", "lag", "load", "zero", "mass", "contact", "drive"
+    "friction",
+    "backlash",
+    "delay",
+    "damping",
+    "inertia",
+    "lag",
+    "load",
+    "zero",
+    "mass",
+    "contact",
+    "drive",
+    "scale",
 ]
 
 

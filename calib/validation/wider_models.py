@@ -16,7 +16,7 @@ from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
-from deal_hw.parameters import Parameter
+from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.template import left_at_zero
 from deal_hw.types import FloatArray
@@ -63,12 +63,18 @@ class WiderFit:
         own = space.to_scale(self.fit.theta[: len(space)]) - space.to_scale(refined.theta)
         return np.append(own, self.fit.latency_s - refined.latency_s)
 
-    def significance(self) -> FloatArray:
-        """Return the further parameters' values in their standard deviations."""
+    def significance(self, off: FloatArray | float = 0.0) -> FloatArray:
+        """Return how far the further parameters are from values without effect, in standard deviations, (L,).
+
+        Args:
+            off: These values, (L,).
+        """
         K, count = len(self.of.space), len(self.more)
+        space = ParameterSpace(self.more)
+        moved = space.to_scale(self.found) - space.to_scale(np.broadcast_to(off, count))
         covariance = np.linalg.pinv(self.fit.normal.hessian) * max(self.fit.chi2, 1.0)
         std = np.sqrt(np.maximum(np.diag(covariance)[K : K + count], 1e-300))
-        return np.asarray(self.found / std)
+        return np.asarray(moved / std)
 
 
 @dataclass(frozen=True, slots=True)

@@ -394,10 +394,12 @@ class Verdict(SearchingBench, SpreadBench):
     """Robots, comma separated; by default all: pendulum, double-pendulum, arm, cart-pole, leg."""
 
     faults: Faults = ()
-    """Faults, comma separated; by default none, friction, backlash, motor-play, jitter, mass, sign. encoders:
-    a right model with encoders. Faults of recordings that commands and measurements share: mirrored, swapped,
-    fast-clock, slow-clock, degrees, doubled, doubled-joint; these calibrations end as soon as they have named
-    the fault."""
+    """Faults, comma separated; by default none and all of these: friction, load-friction, backlash,
+    motor-play, lag, free-speed, servo-dead-zone, motor-dead-zone, motor-asymmetry, encoder-scale,
+    blind-encoder, zeros, jitter, mass, sign. encoders: a right model with encoders. Faults of recordings that
+    commands and measurements share: mirrored, swapped, fast-clock, slow-clock, degrees, doubled,
+    doubled-joint; these calibrations end as soon as they have named the fault. A robot is left out where a
+    fault makes no sense for it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ calibration ends once the fault is named.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -23,22 +24,19 @@ from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation.checks import MOST_CAUSES
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.errors import DealHwError, UnknownNameError
-from deal_hw.testing.plain_robots import (
+from deal_hw.testing.plain_faults import (
+    BLIND,
     CAUSES,
     FAULTS,
-    KINDS,
+    LAWS,
     RIGHT_MODELS,
     SHARED,
     SIGN_WORDS,
     Fault,
-    PlainRobot,
     RightModel,
     SharedFault,
-    has_shared,
-    make_robot,
-    shared_words,
-    write,
 )
+from deal_hw.testing.plain_robots import KINDS, PlainRobot, can_have, make_robot, shared_words, write
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import FilesSettings
@@ -57,7 +55,7 @@ def robots(
 
     Args:
         seeds: Seeds of the truths.
-        kinds: Names in `KINDS`; all by default.
+        kinds: Names in `KINDS`; all by default. A robot is left out where a fault makes no sense for it.
         faults: "none", names in `FAULTS` (all of these by default), in `RIGHT_MODELS` and in `SHARED`.
 
     Raises:
@@ -74,7 +72,7 @@ def robots(
         for fault in faults or usual
         for seed in seeds
         for kind in kinds or KINDS
-        if (shared := _shared(fault)) is None or has_shared(kind, shared)
+        if can_have(kind, known[fault])
     ]
 
 
@@ -132,10 +130,13 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             named = names(kind, fault, [], [str(err)])
             return row | {"colour": "refused", "named": named, "refusal": str(err)}
     causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_CAUSES]]
+    laws = named_laws(result)
+    said = [*map(str, result.alarms), *work.telemetry, *messages]
     return row | {
         "causes": causes,
+        "laws": laws,
         "colour": trust(result).colour,
-        "named": names(kind, fault, causes, [*map(str, result.alarms), *work.telemetry, *messages]),
+        "named": names(kind, fault, causes, said, laws),
         "said": messages,
         "alarms": [str(alarm) for alarm in result.alarms],
         "search": result.provenance.get("search", ""),
@@ -170,7 +171,15 @@ def _ends_when_named(progress: Progress) -> None:
         raise _NamedError(progress.message)
 
 
-def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]) -> bool:
+def named_laws(result: CalibrationResult) -> list[str]:
+    """Return the explanations that a result has, or that an alarm names."""
+    rows = result.provenance.get("candidates", ())
+    return [str(one["explanation"]) for one in rows if one["outcome"] in ("taken", "named")]
+
+
+def names(
+    kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str], laws: Sequence[str] = ()
+) -> bool:
     """Return whether the fault was named; True if there is none.
 
     Args:
@@ -178,6 +187,7 @@ def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]
         fault: A name in `FAULTS` or `SHARED`, or "".
         causes: The causes named by alarms, the likeliest first.
         sentences: Refusals, warnings and alarms.
+        laws: Explanations that the result has, or that an alarm names.
     """
     if (shared := _shared(fault)) is not None:
         return any(words in text for words in shared_words(kind, shared) for text in sentences)
@@ -186,7 +196,18 @@ def names(kind: str, fault: str, causes: Sequence[str], sentences: Sequence[str]
         return True
     if known == "sign":
         return any(word in text for text in sentences for word in SIGN_WORDS)
+    if known == "blind-encoder":
+        return any(_at_blind_place(kind, text) for text in sentences)
+    if known in LAWS:
+        return any(law in LAWS[known] for law in laws)
     return any(cause in CAUSES[known] for cause in causes)
+
+
+def _at_blind_place(kind: str, text: str) -> bool:
+    """Return whether a sentence says that the residual lies where the last joint's encoder is blind."""
+    joint = re.escape(KINDS[kind].joints[-1].name)
+    found = re.search(rf"lies where {joint} is between (-?[\d.]+) and (-?[\d.]+) rad", text)
+    return found is not None and float(found[1]) < BLIND[1] and float(found[2]) > BLIND[0]
 
 
 def against_truth(robot: PlainRobot, result: CalibrationResult) -> dict[str, Any]:

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from deal_hw.bench import verdict as bench_verdict
-from deal_hw.bench.verdict import line, names, robots, run_cell, summary
-from deal_hw.calibration import Budget
+from deal_hw.bench.verdict import line, named_laws, names, robots, run_cell, summary
+from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.errors import UnknownNameError
-from deal_hw.testing import plain_robots
-from deal_hw.testing.plain_robots import COUNTS, FAULTS, KINDS, NOISE, PlainRobot, make_robot, record, write
+from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.testing import plain_effects, plain_faults
+from deal_hw.testing.plain_faults import COUNTS, FAULTS, LAWS, NOISE, WITH_MOTORS, WITH_STEPS
+from deal_hw.testing.plain_robots import KINDS, PlainRobot, can_have, make_robot, record, write
 from deal_hw.types import FloatArray
 
 
@@ -38,16 +40,26 @@ def test_a_robot_is_its_model_with_other_numbers(kind: str) -> None:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_changes_the_recording_beyond_noise(fault: plain_robots.Fault) -> None:
-    """Commands are the same, positions differ by more than ten times the noise (a jitter by five).
+def test_each_fault_changes_the_recording_beyond_noise(
+    fault: plain_faults.Fault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commands are the same, positions differ by more than ten times the noise (jitter by 5, zeros by 4).
 
-    A play of 1 degree behind the encoder changes what it reads by a count or two.
+    A play of 1 degree behind the encoder changes what it reads by a count or two. Motors and limited servos
+    are compared with such a drive without the fault.
     """
-    usual: plain_robots.RightModel | None = "encoders" if fault == "motor-play" else None
-    right, wrong = (samples(make_robot("double-pendulum", 1, f)) for f in (usual, fault))
-    assert np.array_equal(right[:, 3:], wrong[:, 3:])
-    least = {"jitter": 5 * NOISE, "motor-play": 0.9 * COUNTS["hinge"]}.get(fault, 10 * NOISE)
-    assert np.abs(right[:, 1:3] - wrong[:, 1:3]).max() > least
+    kind = next(kind for kind in ("double-pendulum", "cart-pole") if can_have(kind, fault))
+    wrong = samples(make_robot(kind, 1, fault))
+    usual: plain_faults.Fault | plain_faults.RightModel | None = "encoders" if fault == "motor-play" else None
+    if fault in (*WITH_MOTORS, *WITH_STEPS):
+        usual = fault
+        monkeypatch.setattr(plain_effects, "COMMANDS", {})
+        monkeypatch.setattr(plain_effects, "FORCES", {})
+    right, joints = samples(make_robot(kind, 1, usual)), len(KINDS[kind].joints)
+    assert np.array_equal(right[:, 1 + joints :], wrong[:, 1 + joints :])
+    least = {"jitter": 5 * NOISE, "zeros": 4 * NOISE, "motor-play": 0.9 * COUNTS["hinge"]}
+    apart = np.abs(right[:, 1 : 1 + joints] - wrong[:, 1 : 1 + joints]).max()
+    assert apart > least.get(fault, 10 * NOISE)
 
 
 def test_a_robot_with_encoders_has_whole_counts_and_its_models_values() -> None:
@@ -105,11 +117,53 @@ def test_a_fault_is_named_by_its_cause_only(
     assert names("pendulum", fault, causes, sentences) is named
 
 
+@pytest.mark.parametrize("fault", LAWS)
+def test_a_law_names_its_fault_and_its_cause_does_not(fault: str) -> None:
+    """All drives have one cause, so the law itself is asked for; every other one is another fault."""
+    own = LAWS[fault]  # type: ignore[index]
+    others = [law for laws in LAWS.values() for law in laws if law not in own]
+    assert all(names("pendulum", fault, [], [], [law]) for law in own)
+    assert not names("pendulum", fault, ["drive", "friction", "scale"], [], others)
+
+
+@pytest.mark.parametrize(
+    ("joint", "low", "high", "named"),
+    [
+        ("pole", 0.05, 0.4, True),
+        ("pole", 0.3, 0.9, True),
+        ("pole", -0.9, 0.05, False),
+        ("slide", 0.1, 0.3, False),
+    ],
+)
+def test_a_blind_encoder_is_named_by_its_place(joint: str, low: float, high: float, named: bool) -> None:
+    """The joint's name and a stretch that meets the gap, which begins at 0.1 rad and ends at 0.36."""
+    text = f"80 % of its square lies where {joint} is between {low:.2f} and {high:.2f} rad, with 9 %"
+    assert names("cart-pole", "blind-encoder", ["friction"], [text]) is named
+
+
+def test_laws_that_are_taken_or_named_count() -> None:
+    """What was only tried names nothing."""
+    space = ParameterSpace([Parameter.encoder_bias("pivot", 0.1)])
+    found = CalibrationResult(
+        method="local fit",
+        space=space,
+        estimate=space.nominal,
+        interval=np.stack([space.low, space.high], axis=1),
+        latency_s=0.0,
+    )
+    outcomes = {"a": "taken", "b": "named", "c": "chance", "d": "not named"}
+    rows = [{"explanation": name, "outcome": outcome} for name, outcome in outcomes.items()]
+    assert named_laws(dataclasses.replace(found, provenance={"candidates": rows})) == ["a", "b"]
+    assert named_laws(found) == []
+
+
 def test_cells_begin_with_right_models() -> None:
-    """Five robots without a fault for each seed, then each fault."""
+    """Five robots without a fault for each seed, then each fault, with the robots that can have it."""
     found = robots([0, 1])
-    assert len(found) == 2 * len(KINDS) * (1 + len(FAULTS))
+    able = sum(can_have(kind, fault) for kind in KINDS for fault in FAULTS)
+    assert len(found) == 2 * (len(KINDS) + able) and able < len(KINDS) * len(FAULTS)
     assert {fault for _, fault, _ in found[: 2 * len(KINDS)]} == {""}
+    assert [kind for kind, fault, _ in found if fault == "encoder-scale"] == ["cart-pole"] * 2
 
 
 def test_robots_and_faults_are_chosen_by_name() -> None:

@@ -31,7 +31,8 @@ from deal_hw.calib.validation.shared_errors import (
 )
 from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
-from deal_hw.testing.plain_robots import Fault, SharedFault, make_robot, shared_words, write
+from deal_hw.testing.plain_faults import Fault, SharedFault
+from deal_hw.testing.plain_robots import make_robot, shared_words, write
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.calibration.settings import FilesSettings

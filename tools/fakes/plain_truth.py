@@ -11,7 +11,8 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
-from deal_hw.testing.plain_robots import Fault, PlainRobot, make_robot, write
+from deal_hw.testing.plain_faults import Fault
+from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 
