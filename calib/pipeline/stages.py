@@ -287,7 +287,26 @@ class Refinement(Fits):
         if self.predictions is not None and far_from_noise(run, refined):
             run.say("fit", "no values explain the recordings, so fits of predictions follow, and the best")
             return self.predictions.continued(run, searched, refined)
-        return conclude_fit(run, searched, refined, attempt)
+        run = with_laws_tried(run, refined)
+        return with_explanation(run, searched) or conclude_fit(run, searched, refined, attempt)
+
+
+def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
+    """Return the run with the refinement in place of the local fit, and laws that were tried around it.
+
+    The local fit may be in another minimum, around which other laws gain.
+    """
+    from deal_hw.calib.validation.checks import unexplained
+    from deal_hw.calib.validation.explain import try_explanations
+
+    if not (run.settings.diagnosis and run.settings.laws and unexplained(refined)):
+        return run
+    if run.local is not None and np.array_equal(run.local.theta, refined.theta):
+        return run
+    refined = with_rows(refined)
+    with run.check(EXPLANATIONS):
+        tried = try_explanations(run.problem, refined, run.allows)
+    return dataclasses.replace(run, local=refined, tried=tried)
 
 
 def far_from_noise(run: CalibrationRun, refined: Refined) -> bool:
@@ -450,10 +469,10 @@ def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
     )
 
 
-def with_explanation(run: CalibrationRun) -> FitOutcome | None:
+def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = None) -> FitOutcome | None:
     """Return the fit with a law that the model lacks, if only noise is left then; otherwise None.
 
-    No search follows: nothing but noise is left to explain.
+    No search follows: nothing but noise is left to explain. ``searched`` is the result of an earlier one.
     """
     from deal_hw.calib.validation.candidates import law_candidates, ranked
     from deal_hw.calib.validation.explain import explained, rivals
@@ -476,7 +495,7 @@ def with_explanation(run: CalibrationRun) -> FitOutcome | None:
     alarm = dataclasses.replace(best.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
     rows = law_candidates(run.tried, found, best.explanation.name, [one.explanation.name for one in others])
-    return conclude_fit(wide, None, fit).with_alarms(
+    return conclude_fit(wide, searched, fit).with_alarms(
         alarm,
         diagnosis=[one.diagnosis.to_json() for one in (best, *others)],
         candidates=[row.to_json() for row in ranked(rows)],

@@ -23,6 +23,7 @@ from deal_hw.calib.pipeline.stages import (
     CalibrationPipeline,
     far_from_noise,
     with_explanation,
+    with_laws_tried,
     without_search,
 )
 from deal_hw.calib.report.verdict import trust
@@ -262,6 +263,28 @@ def test_only_a_residual_far_from_the_noise_is_fitted_by_predictions() -> None:
     assert not far_from_noise(dataclasses.replace(run, settings=unchecked), poor)
     known = problem.on(problem.episodes, np.ones(2 * problem.coordinates))
     assert not far_from_noise(dataclasses.replace(run, problem=known), poor)
+
+
+@pytest.mark.slow
+def test_a_law_that_explains_all_is_in_the_result_after_a_search() -> None:
+    """Laws are tried around the refinement: the local fit had ended elsewhere, or there was none."""
+    _, problem, fit = truth("pendulum", "backlash")
+    run = small_run(problem, settings=Validation(thorough=True))
+    searched = without_search(problem, run.budget, fit)
+    found = with_explanation(with_laws_tried(run, fit), searched)
+    assert found is not None and found.searched is searched
+    assert len(found.theta) > len(problem.space) and found.chi2 < MISMATCH_CHI2
+
+
+def test_laws_are_tried_once_around_one_fit() -> None:
+    """Nor where they are not asked for, or nothing is left to explain."""
+    _, problem, fit = truth("pendulum", None)
+    poor = dataclasses.replace(fit, chi2=2.0)
+    run = small_run(problem, local=fit)
+    assert with_laws_tried(run, poor) is run
+    assert with_laws_tried(small_run(problem), dataclasses.replace(fit, chi2=0.9)).tried == ()
+    unasked = small_run(problem, settings=Validation(laws=False))
+    assert with_laws_tried(unasked, poor) is unasked
 
 
 @pytest.mark.slow
