@@ -287,8 +287,9 @@ class Refinement(Fits):
         if self.predictions is not None and far_from_noise(run, refined):
             run.say("fit", "no values explain the recordings, so fits of predictions follow, and the best")
             return self.predictions.continued(run, searched, refined)
-        run = with_laws_tried(run, refined)
-        return with_explanation(run, searched) or conclude_fit(run, searched, refined, attempt)
+        again = with_laws_tried(run, refined)
+        found = None if again is run else with_explanation(again, searched)
+        return found or conclude_fit(again, searched, refined, attempt)
 
 
 def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
