@@ -344,7 +344,7 @@ class OutputErrorFits(Fits):
 
         # Sent to workers, so without the fits, which hold the recordings.
         fits = partial(
-            dataclasses.replace(self, first=())._of_fold,
+            dataclasses.replace(self, first=(), given=None)._of_fold,
             starts=[(fit.member, fit.recipe) for fit in whole],
             seed=seed,
             search=run.attempts.search if search else None,
