@@ -29,9 +29,10 @@ from deal_hw.calib.fit.output_error import (
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun
 from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome
+from deal_hw.calib.validation.checks import latency_alarms
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks
 from deal_hw.calib.validation.explain import RIVAL, applicable
-from deal_hw.calib.validation.explanations import Explanation
+from deal_hw.calib.validation.explanations import LAG, Explanation
 from deal_hw.calib.validation.wider_models import NOTICED
 from deal_hw.calibration import listed, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -248,6 +249,9 @@ def screened_laws(
         seconds: Windows of the candidates [s]: the first are those of these fits and their predictions.
     """
     can = applicable(problem)
+    if latency_alarms(problem, fit.latency_s):
+        # A latency beyond its range is the simpler explanation, and an alarm asks for it.
+        can.pop(LAG, None)
     if not can:
         return ScreenedLaws()
     left_out, seen = fold_masks(problem, 2)

@@ -202,6 +202,15 @@ PLAY = Explanation(
     "Repair the gear. Until then use this result: it has the play as {}.",
 )
 
+LAG = Explanation(
+    "drives that lag",
+    "drive",
+    _lag,
+    "The drive follows its command with a first-order lag, as one with a filter or an inductance does.",
+    "Free command_lag of {} (--parameters).",
+    "Use this result: it has the lag as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+)
+
 EXPLANATIONS: Sequence[Explanation] = (
     PLAY,
     Explanation(
@@ -229,14 +238,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Free dof_friction_motor of {} (--parameters).",
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
-        "drives that lag",
-        "drive",
-        _lag,
-        "The drive follows its command with a first-order lag, as one with a filter or an inductance does.",
-        "Free command_lag of {} (--parameters).",
-        "Use this result: it has the lag as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
-    ),
+    LAG,
     Explanation(
         "motors that do more to one side",
         "drive",
