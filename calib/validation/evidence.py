@@ -71,6 +71,7 @@ class Evidence:
     searched: SearchedKinds = field(default_factory=SearchedKinds)
     most_delay_std_s: float = np.inf
     _costs: dict[tuple[int, ...], float] = field(init=False, repr=False, default_factory=dict)
+    _left: dict[int, tuple[Signature, list[FloatArray]]] = field(init=False, repr=False, default_factory=dict)
 
     @property
     def recordings(self) -> list[str]:
@@ -85,19 +86,21 @@ class Evidence:
     def _rest(self) -> list[FloatArray]:
         return [rows.rest for rows in self.rows]
 
-    @cached_property
-    def _columns(self) -> dict[int, list[FloatArray]]:
-        """Each signature's columns without what start states explain, by its identity."""
+    def _columns(self, signature: Signature) -> list[FloatArray]:
+        """Return a signature's columns without what start states explain."""
 
         def left(rows: WindowRows, x: FloatArray) -> FloatArray:
             # Rows of the start states' prior are 0.
             return rows.without_starts(np.pad(x, ((0, 0), (0, rows.start.shape[2]), (0, 0))))
 
-        return {id(s): list(map(left, self.rows, s.columns)) for s in self.found}
+        if id(signature) not in self._left:
+            # The signature is kept, so that no later one has its identity.
+            self._left[id(signature)] = signature, list(map(left, self.rows, signature.columns))
+        return self._left[id(signature)][1]
 
     def _design(self, taken: Sequence[Signature]) -> list[FloatArray]:
         """Return derivatives by the parameters and by signatures, (W, R, P + n) per episode."""
-        columns = [self._columns[id(s)] for s in taken]
+        columns = list(map(self._columns, taken))
         return [np.concatenate(parts, axis=2) for parts in zip(self._following, *columns, strict=True)]
 
     def _normal(self, taken: Sequence[Signature]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

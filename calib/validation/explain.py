@@ -187,12 +187,11 @@ def screened_gain(known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_
     kept = np.arange(len(one_way))
     while len(kept):
         mine = dataclasses.replace(law, columns=tuple(columns[..., kept] for columns in law.columns))
-        seen = dataclasses.replace(known, found=[mine])
         # The residual is prediction minus measurement: a parameter moves against its coefficient.
-        moves = -seen.coefficients([mine])[len(known.prior) :]
+        moves = -known.coefficients([mine])[len(known.prior) :]
         left = kept[(moves > 0) | ~one_way[kept]]
         if len(left) == len(kept):
-            return seen.gain([], [mine])
+            return known.gain([], [mine])
         kept = left
     return 0.0
 
