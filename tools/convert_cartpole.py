@@ -41,10 +41,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from converting import write_recordings
 
 from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.data.importing.npz_source import read_npz
-from deal_hw.errors import DealHwError
 from deal_hw.types import FloatArray
 
 HANGING_COUNT = 1209.82
@@ -186,14 +186,8 @@ def main(arguments: list[str] | None = None) -> int:
         "--rotor", type=float, default=ROTOR_KG, help="armature of the cart [kg]; 0: not searched"
     )
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    try:
-        for path in options.recordings:
-            out = options.out / f"{path.stem}.npz"
-            np.savez_compressed(out, **arrays(read_log(path), options.as_logged))
-            print(out)
-    except DealHwError as error:
-        print(f"error: {error}", file=sys.stderr)
+    as_logged: bool = options.as_logged
+    if not write_recordings(options.recordings, options.out, lambda path: arrays(read_log(path), as_logged)):
         return 1
     (options.out / "columns.yaml").write_text(AS_LOGGED if options.as_logged else COLUMNS, encoding="utf-8")
     model = MODEL.format(rotor=options.rotor, force=FULL_N)

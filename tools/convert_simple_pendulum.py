@@ -44,6 +44,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from converting import write_recordings
 
 from deal_hw.data.importing.csv_source import read_csv
 from deal_hw.errors import DealHwError
@@ -140,6 +141,11 @@ def arrival(time: FloatArray, position: FloatArray) -> int:
     return int(min(stays[0] + 1, time.size - 1)) if stays.size else time.size - 1
 
 
+def controller(path: Path) -> str:
+    """Return the name of the controller of a recording, from its folder."""
+    return path.absolute().parent.name.removeprefix("control_method_")
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -149,14 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--out", type=Path, required=True, help="folder for NPZ files, columns.yaml and model"
     )
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    try:
-        for path in options.recordings:
-            out = options.out / f"{path.absolute().parent.name.removeprefix('control_method_')}.npz"
-            np.savez_compressed(out, **read_log(path))
-            print(out)
-    except DealHwError as error:
-        print(f"error: {error}", file=sys.stderr)
+    if not write_recordings(options.recordings, options.out, read_log, controller):
         return 1
     (options.out / "simple_pendulum.xml").write_text(model(), encoding="utf-8")
     (options.out / "columns.yaml").write_text(COLUMNS, encoding="utf-8")

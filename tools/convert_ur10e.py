@@ -39,6 +39,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from converting import write_recordings
 
 from deal_hw.errors import DealHwError
 
@@ -156,14 +157,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("recordings", type=Path, nargs="+", help="CSV files of the source")
     parser.add_argument("--out", type=Path, required=True, help="folder for NPZ files, model and YAML files")
     options = parser.parse_args(arguments)
-    options.out.mkdir(parents=True, exist_ok=True)
-    try:
-        for path in options.recordings:
-            out = options.out / f"{path.stem}.npz"
-            np.savez_compressed(out, joint_names=np.array(JOINTS), **read_log(path))
-            print(out)
-    except DealHwError as error:
-        print(f"error: {error}", file=sys.stderr)
+    named = {"joint_names": np.array(JOINTS)}
+    if not write_recordings(options.recordings, options.out, lambda path: named | read_log(path)):
         return 1
     columns = COLUMNS + "".join(f"  - {joint}\n" for joint in JOINTS)
     for name, text in (("ur10e.xml", MODEL), ("columns.yaml", columns), ("parameters.yaml", PARAMETERS)):
