@@ -22,7 +22,7 @@ from measuring import Rows, add_seeds, parser
 
 from deal_hw.bench.calibration import make_cells, run_cell
 from deal_hw.bench.settings import FixedRange, Profile
-from deal_hw.scale.where import task_map
+from deal_hw.scale.tasks import task_map
 
 
 def cell(seed: int, method: str, profile: Profile = "sensor") -> tuple[str, float]:

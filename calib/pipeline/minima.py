@@ -20,6 +20,9 @@ from deal_hw.types import FloatArray
 
 CONTACT_DRAWN = 0
 """Refinements from drawn points with feet on the floor, where each takes as long as a search."""
+UNSEEN = 0.1
+"""No more points are drawn below this expected share of points whose minima no fit has found: where five fits
+end alike, or nine in two minima. See :func:`unseen`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,8 +39,6 @@ class RestartSettings:
             population, half drawn in the ranges. On cart-poles whose nominal values lead to another minimum,
             about one in four of the latter leads to the truth. Where none of 8 did (1 to 4 s of balancing,
             noise-free), one of the first three members did.
-        unseen: Share of the points whose minima no fit has found yet, as expected from those found so far,
-            below which no more are drawn: where five fits end alike, or nine in two minima. See `unseen`.
     """
 
     restarts: int = 2
@@ -45,7 +46,6 @@ class RestartSettings:
     fewest_generations: int = 15
     explained: float = MISMATCH_CHI2
     drawn: int = 8
-    unseen: float = 0.1
 
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
@@ -184,7 +184,7 @@ def _lowest(
     fits = in_order(part, partial(from_start, stages_s=_shortest(on_part)), starts)
     levels = [same.chi2]
     while not ((enough or best is not same) and conclusive(part, best, WHITE_SAMPLES)):
-        if unseen(levels, settings.same) <= settings.unseen or (tried := next(fits, None)) is None:
+        if unseen(levels, settings.same) <= UNSEEN or (tried := next(fits, None)) is None:
             break
         levels.append(tried.chi2)
         if np.isfinite(tried.chi2):

@@ -16,7 +16,8 @@ from typing import Annotated, ClassVar, Final, Literal
 from deal_hw.calibration import Budget
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range
-from deal_hw.scale.where import check_device, task_map
+from deal_hw.scale.tasks import task_map
+from deal_hw.scale.where import check_device
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.task_map import TaskMap
 from deal_hw.workflows.calibration.settings import Recordings

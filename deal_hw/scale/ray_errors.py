@@ -9,12 +9,10 @@ import re
 import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from deal_hw.errors import ClusterError, MissingExtraError, short
-
-if TYPE_CHECKING:
-    from deal_hw.scale.where import Where
+from deal_hw.scale.where import Where
 
 CURRENT: Final = Path("/tmp/ray/ray_current_cluster")
 """Where Ray notes the address of the cluster that runs on a machine; it stays when the cluster was killed."""

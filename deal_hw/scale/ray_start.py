@@ -8,14 +8,12 @@ itself, and `ray.init` raises after 30 s. Often the next start is faster, since 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import psutil
 
 from deal_hw.scale.ray_errors import explained, too_slow
-
-if TYPE_CHECKING:
-    from deal_hw.scale.where import Where
+from deal_hw.scale.where import Where
 
 STARTS: Final = 3
 """Times that Ray is started until it counts as not to be started."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from typing_extensions import Self
 
@@ -23,10 +23,8 @@ from deal_hw.errors import ClusterError, TaskLostError, short
 from deal_hw.scale.ray_errors import explained, needs_ray, reachable, words
 from deal_hw.scale.ray_nodes import check_nodes
 from deal_hw.scale.ray_start import start_ray
+from deal_hw.scale.where import Where
 from deal_hw.task_map import InThisProcess, TaskMap
-
-if TYPE_CHECKING:
-    from deal_hw.scale.where import Where
 
 S = TypeVar("S")
 R = TypeVar("R")

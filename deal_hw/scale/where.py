@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from deal_hw.errors import ConfigurationError, shown
-from deal_hw.task_map import InThisProcess, TaskMap
 
 MOST_WORKERS: Final = 1024
 
@@ -60,21 +59,3 @@ def check_device(ray: str | None, engine: str, tasks: str) -> None:
             f"--ray with --engine {engine}: the {tasks} of all workers would share one device; leave one of "
             "the two out"
         )
-
-
-def task_map(ray: str | None, threads: int | None = None) -> TaskMap:
-    """Return what does tasks where `--ray` says.
-
-    Args:
-        ray: "local", "local:4" or the address of a cluster; None: this process.
-        threads: Processors that each task takes; None for 1.
-
-    Raises:
-        ConfigurationError: It names no place.
-        MissingExtraError: Ray is not installed.
-    """
-    if ray is None:
-        return InThisProcess()
-    from deal_hw.scale.ray_tasks import RayTasks
-
-    return RayTasks(parse_where(ray), threads or 1)

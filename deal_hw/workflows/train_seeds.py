@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from deal_hw.errors import ConfigurationError, TaskLostError, TrainingError
-from deal_hw.scale.where import check_device, task_map
+from deal_hw.scale.tasks import task_map
+from deal_hw.scale.where import check_device
 from deal_hw.training import TrainingStatus
 from deal_hw.workflows.say import html_table, text_table
 from deal_hw.workflows.train import (

@@ -120,7 +120,7 @@ os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 import ray
 from ray.cluster_utils import Cluster
 from deal_hw.errors import DealHwError
-from deal_hw.scale.where import task_map
+from deal_hw.scale.tasks import task_map
 
 cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 second = cluster.add_node(num_cpus=1, env_vars=json.loads(sys.argv[1]))
@@ -150,7 +150,7 @@ import numpy as np
 from functools import partial
 from ray.cluster_utils import Cluster
 from deal_hw.errors import DealHwError
-from deal_hw.scale.where import task_map
+from deal_hw.scale.tasks import task_map
 
 head = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80 * 2**20}
 cluster = Cluster(initialize_head=True, head_node_args=head)

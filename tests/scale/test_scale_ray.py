@@ -32,7 +32,7 @@ from functools import partial
 from pathlib import Path
 import psutil
 from deal_hw.errors import ConfigurationError, TaskLostError
-from deal_hw.scale.where import task_map
+from deal_hw.scale.tasks import task_map
 from deal_hw.task_map import InThisProcess
 
 folder, found = Path.cwd(), {}

@@ -25,7 +25,8 @@ from deal_hw.scale import facts, ray_errors
 from deal_hw.scale.ray_errors import reachable, words
 from deal_hw.scale.ray_nodes import clocks_apart, difference
 from deal_hw.scale.ray_start import start_ray
-from deal_hw.scale.where import Where, parse_where, task_map
+from deal_hw.scale.tasks import task_map
+from deal_hw.scale.where import Where, parse_where
 from deal_hw.task_map import InThisProcess, TaskMap
 
 

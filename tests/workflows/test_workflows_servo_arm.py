@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.errors import PolicyError
 from deal_hw.findings import Severity
 from deal_hw.workflows.robot import carries_robot
+from deal_hw.workflows.running.report import RunReport
 
 pytestmark = pytest.mark.real_time
 
@@ -38,6 +39,15 @@ def port(robot: Path) -> Iterator[str]:
     with deal_hw.emulate(str(robot), profile="sensor", seed=1) as emulated:
         yield emulated.port
     assert set(emulated.truth["parameters"]) >= {"shoulder.frictionloss", "elbow.servo_stiffness"}
+
+
+def undisturbed(run: Callable[[], RunReport]) -> RunReport:
+    """Repeat a run, as a user would, that ended because a busy computer delayed a state by 100 ms: twice."""
+    for _ in range(2):
+        report = run()
+        if report.episodes[-1].flags != ("state_stale",):
+            return report
+    return run()
 
 
 def test_doctor_finds_the_servos_and_their_states(robot: Path, port: str) -> None:
@@ -62,7 +72,7 @@ def test_robot_check_compares_file_and_servos(
 def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Path) -> None:
     """The dataset holds the robot, by which calibrate finds its kind; the replay needs only the recording."""
     run = tmp_path / "run"
-    report = deal_hw.collect(str(robot), port=port, out=run, motion="chirp", seconds=2.0)
+    report = undisturbed(lambda: deal_hw.collect(str(robot), port=port, out=run, motion="chirp", seconds=2.0))
     assert report.outcome is Outcome.FINISHED, report
     assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 150
     dataset = run / "dataset"
@@ -70,7 +80,7 @@ def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Pa
     assert "hardware:" in kept and "zero: 2000" in kept
     assert json.loads((dataset / "dataset.json").read_text())["description"]["name"] == "two joints"
     assert carries_robot(dataset)
-    again = deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again")
+    again = undisturbed(lambda: deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again"))
     assert again.outcome is Outcome.FINISHED, again
     difference = again.episodes[0].replay
     assert difference is not None and difference.position.max() < 0.05
@@ -78,7 +88,8 @@ def test_collect_records_and_replay_repeats(robot: Path, port: str, tmp_path: Pa
 
 def test_random_set_points_need_no_policy(robot: Path, port: str, tmp_path: Path) -> None:
     """An arm stands without one; a policy that nobody named is asked for."""
-    report = deal_hw.collect(str(robot), port=port, out=tmp_path / "rich", seconds=2.0, attempts=1)
+    rich = tmp_path / "rich"
+    report = undisturbed(lambda: deal_hw.collect(str(robot), port=port, out=rich, seconds=2.0, attempts=1))
     assert report.outcome is Outcome.FINISHED, report
     with pytest.raises(PolicyError, match="needs a policy"):
         deal_hw.deploy(str(robot), port=port, out=tmp_path / "deployed")
@@ -100,8 +111,10 @@ def test_two_arms_of_seven_joints_share_a_bus(bus: str, tmp_path: Path) -> None:
     robot = str(tmp_path / "robot.yaml")
     with deal_hw.emulate(robot, profile="sensor", seed=1) as emulated:
         port = emulated.port
-        report = deal_hw.collect(robot, port=port, out=tmp_path / "run", motion="chirp", seconds=4.0)
-        again = deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again")
+        report = undisturbed(
+            lambda: deal_hw.collect(robot, port=port, out=tmp_path / "run", motion="chirp", seconds=4.0)
+        )
+        again = undisturbed(lambda: deal_hw.replay(report.paths[0], port=port, out=tmp_path / "again"))
     assert report.outcome is again.outcome is Outcome.FINISHED
     assert report.episodes[0].passive_confirmed and report.episodes[0].states_recorded > 150
     found = read_trajectory(report.paths[0])

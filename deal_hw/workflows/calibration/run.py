@@ -31,7 +31,7 @@ from deal_hw.calibration import (
 from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError
 from deal_hw.findings import Finding
 from deal_hw.parameters import ParameterSpace
-from deal_hw.scale.where import task_map
+from deal_hw.scale.tasks import task_map
 from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSettings
