@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis
 from deal_hw.calib.validation.evidence import Evidence, groups_of
 from deal_hw.calib.validation.explain import Explained, Tried
+from deal_hw.types import FloatArray
 
 Judged = Literal["fit", "effect", "likelihood", "folds"]
 """A fit with it to a part of the recordings; its linearised effect around the fit without it, regressed on
@@ -73,10 +74,13 @@ class Diagnosed:
     Attributes:
         causes: The causes, best supported first.
         candidates: All that was tried for it.
+        unsure: Root mean square shift of the estimates by causes that are not named but may be there: of each
+            parameter in its own scale, and of the latency [s], (K + 1,); empty where none was examined.
     """
 
     causes: tuple[Diagnosis, ...] = ()
     candidates: tuple[Candidate, ...] = ()
+    unsure: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def law_candidates(

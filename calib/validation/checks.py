@@ -190,6 +190,7 @@ def judge(
         known = widened_by_split_half(known, split, refined.latency_s, problem.latency_range_s)
         facts["split_half"] = split.to_json()
     if asked:
+        known = with_unsure(problem, refined, known, found.unsure)
         known, facts["diagnosis"] = with_causes(problem, refined, known, found.causes)
         facts["candidates"] = [one.to_json() for one in found.candidates]
     return known, facts
@@ -216,6 +217,26 @@ def with_causes(
     if not found and refined.chi2 > MISMATCH_CHI2:
         alarms = [Unexplained.larger(refined.chi2, place=residual_place(problem, refined))]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
+
+
+def with_unsure(problem: Problem, refined: Refined, known: Uncertainty, unsure: FloatArray) -> Uncertainty:
+    """Return ``known`` with intervals widened by what causes that are not named may have moved.
+
+    Args:
+        problem: The problem.
+        refined: Its fit.
+        known: The fit's uncertainty.
+        unsure: Standard deviation of the shift, (K + 1,), as :class:`Diagnosed` has it; empty for none.
+    """
+    if not len(unsure):
+        return known
+    variance = np.diag(known.covariance) + unsure[:-1] ** 2
+    known = known.widened_to(np.where(known.blind, 0.0, np.sqrt(variance)))
+    reach_s = known.latency_reach_s(refined.latency_s)
+    if problem.fixed_latency_s is not None:
+        return known
+    wider_s = float(np.hypot(reach_s, Z90 * unsure[-1]))
+    return known.latency_widened_to(wider_s, refined.latency_s, problem.latency_range_s)
 
 
 def biased(problem: Problem, known: Uncertainty, causes: Sequence[Diagnosis]) -> Uncertainty:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -131,6 +131,7 @@ def diagnose(
                 rows.append(Candidate(explanation=ZEROS, judged="fit", outcome="chance"))
     wider += zeros
     found, effects = [one for one in wider if one.share >= DECISIVE], list[Diagnosis]()
+    unsure = np.zeros(0)
     if not found:
         wider = [one for one in wider if supported(one.share, refined.chi2)]
         named = {one.code for one in wider}
@@ -138,9 +139,11 @@ def diagnose(
         effects = [one for one in effects if one.code != "mass" or weighs(problem, refined, one, allows)]
         found = sorted((*effects, *wider), key=lambda f: -f.deviance)
         rows += effect_candidates(known(), effects)
+        if refined.chi2 <= POOR:
+            unsure = unsure_shift(known(), {one.code for one in found})
     rows += [Candidate.of(ZEROS, "fit", one, "named" if one in found else "not named") for one in zeros]
     rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
-    return Diagnosed(tuple(found), ranked(rows))
+    return Diagnosed(tuple(found), ranked(rows), unsure)
 
 
 def weighs(problem: Problem, refined: Refined, cause: Diagnosis, allows: Allows) -> bool:
@@ -232,6 +235,37 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     return sorted(found, key=lambda f: -f.deviance)
 
 
+def unsure_shift(known: Evidence, named: Collection[str]) -> FloatArray:
+    """Return how far causes that are not named may have moved the estimates, (P,), as a standard deviation.
+
+    What is no better than chance to be named may still be there. Each cause alone, and none, weighs as much
+    as it makes the left-out motion likely (pseudo-BMA: Yao, Vehtari, Simpson and Gelman 2018), w_i
+    proportional to exp(D_i / 2) with the gain in deviance D_i, 0 for none. The estimates keep their place, so
+    the mean square of their shifts s_i, sum_i w_i s_i^2, adds to their variance. What is the parameters' own
+    effect is no other cause.
+    """
+    groups = [
+        [other for s in group if (other := known.distinct(s)) is not None]
+        for group in groups_of(known.found)
+        if group[0].cause not in named
+    ]
+    groups = [group for group in groups if group and _possible(known, [], group)]
+    gains = np.array([0.0, *(known.gain([], group) for group in groups)])
+    weights = np.exp((gains - gains.max()) / 2)
+    shifts = [np.zeros(len(known.prior)), *(_shift(known, [], group) for group in groups)]
+    return np.asarray(np.sqrt(weights / weights.sum() @ np.square(shifts)))
+
+
+def _shift(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> FloatArray:
+    """Return the change of the parameters and the latency where the fit may have a group's effect, too, (P,).
+
+    The residual is prediction minus measurement: a parameter moves against its coefficient.
+    """
+    P = len(known.prior)
+    before, after = (known.coefficients(these)[:P] for these in (taken, [*taken, *group]))
+    return before - after
+
+
 def _simplest(groups: Sequence[Sequence[Signature]], gains: Sequence[float]) -> int:
     """Return the group that gains most; a constant force where zeros of each recording gain no more."""
     best, causes = int(np.argmax(gains)), [group[0].cause for group in groups]
@@ -281,10 +315,7 @@ def _cause_diagnosis(
         order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
         joints = [group[k].where for k in order[:4]]
         found = _diagnosis(known, cause, share, deviance, joints)
-    P = len(known.prior)
-    before, after = (known.coefficients(these)[:P] for these in (taken, [*taken, *group]))
-    # The residual is prediction minus measurement: a parameter moves against its coefficient.
-    return dataclasses.replace(found, shift=before - after)
+    return dataclasses.replace(found, shift=_shift(known, taken, group))
 
 
 def _diagnosis(

@@ -39,6 +39,10 @@ ROUNDS = 2
 PARAMETER_PRIOR = 0.5
 """Spread of parameters in the regression, as a share of their range [-]."""
 
+OWN = 0.02
+"""A signature of which the parameters explain all but this share is their own effect. On 12 cart-poles the
+signatures of an inertia and a damping that were searched left 0 to 0.8 %, those of other causes 3 to 95 %."""
+
 LATENCY_PRIOR_S = 0.02
 """Spread of the latency in the regression [s]."""
 
@@ -119,6 +123,19 @@ class Evidence:
         """Return the regression's coefficients on all windows, parameters first, (P + n,)."""
         matrix, vector, _, prior = self._normal(taken)
         return np.asarray(np.linalg.solve(matrix.sum(axis=0) + np.diag(prior), vector.sum(axis=0)))
+
+    def distinct(self, signature: Signature) -> Signature | None:
+        """Return a signature without columns that are the parameters' own effect; None if nothing is left."""
+        matrix, _, _, prior = self._normal([signature])
+        P, total = len(self.prior), matrix.sum(axis=0)
+        own = np.diag(total)[P:]
+        explained = np.linalg.solve(total[:P, :P] + np.diag(prior[:P]), total[:P, P:])
+        left = own - np.einsum("pn,pn->n", total[:P, P:], explained)
+        keep = left > OWN * own
+        if keep.all():
+            return signature
+        columns = tuple(c[..., keep] for c in signature.columns)
+        return dataclasses.replace(signature, columns=columns) if keep.any() else None
 
     def residual(self, taken: Sequence[Signature]) -> list[FloatArray]:
         """Return the residual after the regression, (W, R) per episode."""

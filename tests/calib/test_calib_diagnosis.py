@@ -14,14 +14,14 @@ from fakes.plain_truth import problem_of, truth
 
 from deal_hw.calib.data.parts import part_of
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, Z90, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
-from deal_hw.calib.validation.checks import biased, unexplained, with_causes
+from deal_hw.calib.validation.checks import biased, unexplained, with_causes, with_unsure
 from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, weighs
+from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, unsure_shift, weighs
 from deal_hw.calib.validation.evidence import Evidence, evidence
 from deal_hw.calib.validation.explain import explained, try_explanations
 from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
@@ -99,6 +99,49 @@ def test_a_parameter_that_other_windows_hardly_show_makes_no_cause() -> None:
     damping = moved_by(-0.3 * v)
     assert [cause.code for cause in name_causes(knee_evidence(damping, (damping * seen,)))] == ["damping"]
     assert name_causes(known) == []
+
+
+def test_causes_that_may_be_there_move_a_parameter() -> None:
+    """A load beside a parameter that pushes 1 + v: with a load it is 0, and with damping of its other part.
+
+    Both explain all, so each weighs 1/2: the load moves it by least squares, the damping by a tenth of that.
+    """
+    v, _ = knee_motion()
+    load, push = (moved_by(force) for force in (np.ones_like(v), 1 + v))
+
+    def seen(known: Evidence, moved: FloatArray) -> FloatArray:
+        return known.rows[0].without_starts(np.pad(moved / STD, ((0, 0), (0, 2)))[..., None]).ravel()
+
+    known = knee_evidence(0.02 * load, (push,))
+    alone = float(seen(known, 0.02 * load) @ seen(known, push) / np.sum(seen(known, push) ** 2))
+    assert unsure_shift(known, ())[0] == pytest.approx(alone / np.sqrt(2), rel=0.1)
+    assert unsure_shift(known, {"load", "damping"})[0] < 0.1 * alone
+    little = knee_evidence(0.004 * load, (push,))
+    assert name_causes(little) == [] and unsure_shift(little, ())[0] > 0.2 * alone / 5
+
+
+def test_a_parameters_own_effect_is_no_other_cause() -> None:
+    """However little the recordings show of it."""
+    v, _ = knee_motion()
+    known = knee_evidence(np.zeros_like(v), (moved_by(np.ones_like(v)),))
+    assert [s.cause for s in known.found if known.distinct(s) is None] == ["load"]
+    assert all(known.distinct(s) in (s, None) for s in known.found)
+
+
+def test_intervals_hold_what_was_unsure(small_problem: Callable[..., Problem]) -> None:
+    """Standard deviations of 3 and 4 are one of 5; so are reaches of a latency of 3 ms and 4 ms."""
+    problem = small_problem(fixed_latency_s=None)
+    fit = with_rows(refine(problem, problem.space.nominal, 0.03, (0.2,), iterations=2))
+    K, low = len(problem.space), fit.latency_s - 0.003
+    known = dataclasses.replace(
+        uncertainty_at(problem, fit).with_covariance(9e-6 * np.eye(K)),
+        blind=np.zeros(K, dtype=bool),
+        latency_interval_s=(low, fit.latency_s + 0.003),
+    )
+    wider = with_unsure(problem, fit, known, np.append(np.full(K, 0.004), 0.004 / Z90))
+    assert np.sqrt(np.diag(wider.covariance)) == pytest.approx(0.005)
+    assert wider.latency_interval_s == pytest.approx((fit.latency_s - 0.005, fit.latency_s + 0.005))
+    assert with_unsure(problem, fit, known, np.zeros(0)) is known
 
 
 @pytest.mark.parametrize(
