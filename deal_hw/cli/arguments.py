@@ -225,6 +225,24 @@ class CommandLine:
                 options[entry.name] = (not flag.startswith("--no-")) if entry.values == 0 else value
         return Arguments(self.positional[0] if self.positional else None, options)
 
+    @property
+    def collected(self) -> list[str]:
+        """The words, with the values of an option that takes any number behind its first word.
+
+        ``--range a 1 2 --range b 3 4`` names two ranges. The parser would take the last one alone.
+        """
+        endless: dict[str, list[str]] = {}
+        found: list[list[str]] = [self.positional]
+        for flag, entry, values in self.given:
+            if entry is None or entry.values is not None:
+                found.append([f"{flag}={values[0]}"] if len(values) == 1 else [flag, *values])
+            elif entry.name in endless:
+                endless[entry.name] += values
+            else:
+                endless[entry.name] = [flag, *values]
+                found.append(endless[entry.name])
+        return [word for words in found for word in words]
+
 
 def check(line: str, words: Sequence[str], settings: type[Any], others: Callable[[str], list[str]]) -> None:
     """Refuse words that the parser would refuse, each by one line.

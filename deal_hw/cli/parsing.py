@@ -274,6 +274,9 @@ def read_settings(
         page = f"{line} {HELP_ALL if verb.common else '--help'}"
         message = kinds.doubted(given.arguments, str(error))
         raise ConfigurationError(f"{message}; all options: {page}") from None
+    several = [entry.name for _, entry, _ in given.given if entry is not None and entry.values is None]
+    if len(set(several)) < len(several):
+        words = CommandLine(words, options_of(chosen.settings).values()).collected
     return _parsed(chosen.settings, words, line)
 
 

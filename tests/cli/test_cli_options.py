@@ -14,7 +14,7 @@ import pytest
 from verb_options import dataclasses_of
 
 from deal_hw.calib.pipeline.methods import DEFAULT_SEARCH, METHODS, SEARCHES
-from deal_hw.cli.main import main, run
+from deal_hw.cli.main import main, parse, run
 from deal_hw.cli.verbs import VERBS
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.ranges import Range
@@ -257,6 +257,16 @@ def test_words_that_do_not_parse_get_one_line(
     kind += [" dataset"] * (verb == "calibrate")
     page = f"deal-hw {verb}{''.join(kind)} --help{'-all' if VERBS[verb].common and others else ''}"
     assert printed.err.endswith(f"; all options: {page}\n") and not printed.out
+
+
+def test_an_option_of_several_values_may_come_several_times() -> None:
+    """Values of all of them count, as many people write it; of one value the last counts, as everywhere."""
+    line = "--model m.xml --data a.csv --seed 1 --range pole.mass 1 2 --data=b.csv --start-std a 0.1"
+    settings, _ = parse("calibrate", [*line.split(), *"--seed 2 --range cart.mass 3 4 --no-laws".split()])
+    assert settings.data == (Path("a.csv"), Path("b.csv")) and settings.seed == 2 and not settings.laws
+    assert settings.range == (("pole.mass", 1.0, 2.0), ("cart.mass", 3.0, 4.0))
+    settings, _ = parse("calibrate", "d --episodes 0 --latency-range 0.01 0.1 --episodes 2 3".split())
+    assert settings.episodes == (0, 2, 3) and settings.latency_range == (0.01, 0.1)
 
 
 @pytest.mark.parametrize(
