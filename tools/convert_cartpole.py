@@ -21,8 +21,9 @@ The potentiometer does not read as the log says. Hanging still is at 1209.82 cou
 rad (swings of a known centre, both sides of the blind angle), where the log has 2 pi / 4096. Over about 0.26
 rad the slider touches nothing: the first and the last counts, below 8 and above 4086, are no angles, and
 their rows are left out. So is a last reading before them that the sensor holds. The angle is unwrapped; 0 is
-upright, as in the model. `--as-logged` keeps the log's angle instead, which wraps at +-pi, all rows, and the
-normalised command: what `deal-hw data import` says of these is worth reading.
+upright, as in the model. `--keep-gap` keeps these rows: the gap is from -5.19 to -4.92 rad, and a calibration
+shows that much of its residual lies there. `--as-logged` keeps the log's angle instead, which wraps at +-pi,
+all rows, and the normalised command: what `deal-hw data import` says of these is worth reading.
 
 Calibrate and import as the recordings of any robot:
 
@@ -136,9 +137,9 @@ def read_log(path: Path) -> Log:
     return Log(*(channels.column(name) for name in names))
 
 
-def repaired(log: Log) -> tuple[Mask, FloatArray]:
+def repaired(log: Log, keep_gap: bool = False) -> tuple[Mask, FloatArray]:
     """Return which rows have an angle, (T,), and the unwrapped angles of these [rad], 0 upright."""
-    sound = (log.count >= FIRST_COUNT) & (log.count <= LAST_COUNT)
+    sound = ((log.count >= FIRST_COUNT) & (log.count <= LAST_COUNT)) | keep_gap
     return sound, np.unwrap((log.count[sound] - HANGING_COUNT) * RAD_PER_COUNT - np.pi)
 
 
@@ -155,12 +156,12 @@ def held(log: Log, sound: Mask) -> Mask:
     return found
 
 
-def arrays(log: Log, as_logged: bool = False) -> dict[str, Any]:
+def arrays(log: Log, as_logged: bool = False, keep_gap: bool = False) -> dict[str, Any]:
     """Return the arrays of the NPZ file; ``every_`` ones include held angles, for tools/score_cartpole.py."""
     if as_logged:
         return {"time": log.sent_s, "position": log.position_m, "angle": log.angle, "Q": log.power}
-    sound, angle = repaired(log)
-    kept = ~held(log, sound)[sound]
+    sound, angle = repaired(log, keep_gap)
+    kept = np.ones(angle.size, dtype=bool) if keep_gap else ~held(log, sound)[sound]
     return {
         "time": log.sent_s[sound][kept],
         "cart_position": log.position_m[sound][kept],
@@ -181,13 +182,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, required=True, help="folder for NPZ files, columns.yaml and model"
     )
-    parser.add_argument("--as-logged", action="store_true", help="keep the log's angle and command")
+    kept = parser.add_mutually_exclusive_group()
+    kept.add_argument("--keep-gap", action="store_true", help="keep rows in which the slider touches nothing")
+    kept.add_argument("--as-logged", action="store_true", help="keep the log's angle and command")
     parser.add_argument(
         "--rotor", type=float, default=ROTOR_KG, help="armature of the cart [kg]; 0: not searched"
     )
     options = parser.parse_args(arguments)
-    as_logged: bool = options.as_logged
-    if not write_recordings(options.recordings, options.out, lambda path: arrays(read_log(path), as_logged)):
+    as_logged, keep_gap = options.as_logged, options.keep_gap
+
+    def read(path: Path) -> dict[str, Any]:
+        return arrays(read_log(path), as_logged, keep_gap)
+
+    if not write_recordings(options.recordings, options.out, read):
         return 1
     (options.out / "columns.yaml").write_text(AS_LOGGED if options.as_logged else COLUMNS, encoding="utf-8")
     model = MODEL.format(rotor=options.rotor, force=FULL_N)

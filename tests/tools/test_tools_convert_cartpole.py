@@ -61,6 +61,18 @@ def test_a_held_reading_before_the_gap_is_no_angle(tmp_path: Path) -> None:
     assert score_cartpole.read(out / "Experiment-0.npz").measured.sum() == len(counts) - 2
 
 
+def test_the_gap_can_be_kept(tmp_path: Path) -> None:
+    """2 counts are (2 - 1209.82) 0.001467 - pi = -4.913 rad, one turn on behind 4086 counts."""
+    counts = [1210, 2500, 3700, 4086, 4095, 2, 8, 200] + [1210] * 15
+    out = tmp_path / "out"
+    assert convert_cartpole.main([str(log(tmp_path, counts)), "--out", str(out), "--keep-gap"]) == 0
+    with np.load(out / "Experiment-0.npz") as file:
+        assert len(file["time"]) == len(file["every_time"]) == len(counts)
+        np.testing.assert_allclose(
+            file["pole_angle"][3:6], [1.07776, 1.09097, -4.91346 + 2 * np.pi], atol=1e-4
+        )
+
+
 def test_as_logged_keeps_angle_and_power(tmp_path: Path) -> None:
     """The importer unwraps the log's angle, and the map says what a power of 1 is."""
     path = log(tmp_path, [1210] * 60)
