@@ -90,6 +90,12 @@ class Evidence:
     def _rest(self) -> list[FloatArray]:
         return [rows.rest for rows in self.rows]
 
+    @cached_property
+    def _information(self) -> FloatArray:
+        """Information on the parameters, the prior's included, (P, P)."""
+        data = [np.tensordot(x, x, axes=((0, 1), (0, 1))) for x in self._following]
+        return np.asarray(np.sum(data, axis=0) + np.diag(self.prior))
+
     def _columns(self, signature: Signature) -> list[FloatArray]:
         """Return a signature's columns without what start states explain."""
 
@@ -126,11 +132,10 @@ class Evidence:
 
     def distinct(self, signature: Signature) -> Signature | None:
         """Return a signature without columns that are the parameters' own effect; None if nothing is left."""
-        matrix, _, _, prior = self._normal([signature])
-        P, total = len(self.prior), matrix.sum(axis=0)
-        own = np.diag(total)[P:]
-        explained = np.linalg.solve(total[:P, :P] + np.diag(prior[:P]), total[:P, P:])
-        left = own - np.einsum("pn,pn->n", total[:P, P:], explained)
+        pairs = list(zip(self._following, self._columns(signature), strict=True))
+        across = np.sum([np.tensordot(x, c, axes=((0, 1), (0, 1))) for x, c in pairs], axis=0)
+        own = np.sum([np.sum(c**2, axis=(0, 1)) for _, c in pairs], axis=0)
+        left = own - np.sum(across * np.linalg.solve(self._information, across), axis=0)
         keep = left > OWN * own
         if keep.all():
             return signature

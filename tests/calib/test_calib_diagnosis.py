@@ -14,7 +14,7 @@ from fakes.plain_truth import problem_of, truth
 
 from deal_hw.calib.data.parts import part_of
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, Z90, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.validation import diagnosis
@@ -36,6 +36,7 @@ from deal_hw.calib.validation.signatures import (
     signatures,
 )
 from deal_hw.calib.validation.wider_models import fit_wider, zero_parameters
+from deal_hw.calibration import Z90
 from deal_hw.testing.plain_robots import make_robot
 from deal_hw.types import FloatArray
 
