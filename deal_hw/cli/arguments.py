@@ -35,6 +35,7 @@ class Option:
         owner: The settings with that field.
         kinds: Types of its value; of each value, if there may be several.
         values: How many values it takes; 0 for a flag, None for any number.
+        row: Types of the values of an entry, where each has several: a name and two numbers. Empty otherwise.
         required: Whether it must be given.
         positional: Whether it is an argument without a name.
         on: Whether it is a flag that is on by default, which ``--no-NAME`` switches off.
@@ -44,6 +45,7 @@ class Option:
     owner: type[Any]
     kinds: tuple[Any, ...]
     values: int | None
+    row: tuple[type, ...]
     required: bool
     positional: bool
     on: bool
@@ -67,15 +69,24 @@ class Option:
         found = [one for kind in self.kinds if get_origin(kind) is Literal for one in get_args(kind)]
         return BOOLEANS if bool in self.kinds and self.values else tuple(map(str, found))
 
-    def check(self, value: str) -> None:
-        """Refuse a value of the wrong type; the settings check ranges and choices.
+    def check(self, values: Sequence[str]) -> None:
+        """Refuse values of the wrong type or number; the settings check ranges and choices.
 
         Raises:
-            ConfigurationError: The value is no number, or neither True nor False.
+            ConfigurationError: A value is no number, or neither True nor False, or an entry lacks one.
         """
-        if NoneType in self.kinds and value == "None":
+        if self.row and len(values) % len(self.row):
+            raise ConfigurationError(
+                f"{self.shown} takes {len(self.row)} values each, and {short(' '.join(values))!r} is "
+                f"{len(values)}; {self.meaning}"
+            )
+        for number, value in enumerate(values):
+            self._check(value, (self.row[number % len(self.row)],) if self.row else self.kinds)
+
+    def _check(self, value: str, allowed: Sequence[Any]) -> None:
+        if NoneType in allowed and value == "None":
             return
-        kinds = set(self.kinds) - {NoneType}
+        kinds = set(allowed) - {NoneType}
         wrong = ""
         if kinds == {bool} and value not in BOOLEANS:
             wrong = "is neither True nor False"
@@ -109,21 +120,24 @@ def options_of(settings: Any) -> Mapping[str, Option]:
             continue
         tuples = [kind for kind in kinds if get_origin(kind) is tuple]
         count: int | None = 0 if kinds == (bool,) else 1
+        row: tuple[type, ...] = ()
         for several in tuples:
             parts = get_args(several)
             endless = parts[-1] is Ellipsis
             count = None if endless or count is None else len(parts)
             kinds = tuple(_kinds(parts[0])) if endless or len(set(parts)) == 1 else (str,)
-            kinds = (str,) if any(get_origin(kind) is tuple for kind in kinds) else kinds
+            if get_origin(parts[0]) is tuple:
+                kinds, row = (str,), get_args(parts[0])
         if any(isinstance(mark, OneWord) for mark in get_args(hint)[1:]):
             # It has a parser of its own, such as for several numbers in one word.
-            kinds, count = (str,), 1
+            kinds, count, row = (str,), 1, ()
         missing = dataclasses.MISSING
         found[entry.name] = Option(
             name=entry.name,
             owner=settings,
             kinds=kinds,
             values=count,
+            row=row,
             required=entry.default is missing and entry.default_factory is missing,
             positional=is_positional(settings, entry.name, hint),
             on=count == 0 and entry.default is True,
@@ -266,8 +280,7 @@ def check(line: str, words: Sequence[str], settings: type[Any], others: Callable
         wanted = "a value" if entry.values in (1, None) else f"{entry.values} values"
         if entry.values != 0 and len(values) < (1 if entry.values is None else entry.values):
             raise ConfigurationError(f"{flag} needs {wanted}; {entry.meaning}")
-        for value in values:
-            entry.check(value)
+        entry.check(values)
     arguments = [one for one in options.values() if one.positional]
     room = sum(len(given.positional) if one.values is None else 1 for one in arguments)
     if len(given.positional) > room:

@@ -298,7 +298,7 @@ def _parsed(settings: type[Any], words: Sequence[str], line: str) -> Any:
         if cause is not None:
             raise cause from None
         raise ConfigurationError(
-            f"`{line} {' '.join(words)}` cannot be understood; options: {line} --help"
+            f"`{' '.join(words)}` cannot be understood behind `{line}`; options: {line} --help"
         ) from None
 
 

@@ -243,6 +243,14 @@ def test_a_refused_number_gets_one_line(line: str, words: str, capsys: pytest.Ca
             "--steps: '1.5' is no whole number; --steps is: Environment steps",
         ),
         ("inspect e.mcap --at soon", "--at: 'soon' is no number; --at is: Device time"),
+        (
+            "calibrate d --range cart.mass 1",
+            "d does not exist; --range takes 3 values each, and 'cart.mass 1' is 2; --range is: ",
+        ),
+        (
+            "calibrate d --known cart.mass heavy",
+            "d does not exist; --known: 'heavy' is no number; --known is: ",
+        ),
     ],
 )
 def test_words_that_do_not_parse_get_one_line(
@@ -267,6 +275,14 @@ def test_an_option_of_several_values_may_come_several_times() -> None:
     assert settings.range == (("pole.mass", 1.0, 2.0), ("cart.mass", 3.0, 4.0))
     settings, _ = parse("calibrate", "d --episodes 0 --latency-range 0.01 0.1 --episodes 2 3".split())
     assert settings.episodes == (0, 2, 3) and settings.latency_range == (0.01, 0.1)
+
+
+def test_two_values_of_one_parameter_are_refused() -> None:
+    """Nobody knows which is meant."""
+    with pytest.raises(ConfigurationError, match=r"^--range names cart.mass twice; give one of them$"):
+        parse("calibrate", "d --range cart.mass 1 2 --range cart.mass 2 3".split())
+    with pytest.raises(ConfigurationError, match=r"^--known names pole.mass, cart.mass twice"):
+        parse("calibrate", ["d", "--known", *"pole.mass 1 cart.mass 1 pole.mass 1 cart.mass 2".split()])
 
 
 @pytest.mark.parametrize(

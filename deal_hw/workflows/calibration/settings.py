@@ -21,12 +21,12 @@ from deal_hw.calib.pipeline.methods import (
     usual_budget,
     with_search,
 )
-from deal_hw.calibration import LATENCY_RANGE_S, Budget
+from deal_hw.calibration import LATENCY_RANGE_S, Budget, listed
 from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings
 from deal_hw.data.files import dataset_of
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
-from deal_hw.ranges import Checked, Range
+from deal_hw.ranges import Checked, Range, option
 from deal_hw.sim.engine.gpu import WantedEngine
 from deal_hw.workflows.calibration.source import Division
 from deal_hw.workflows.kinds import InputKind, Kinds, fitting
@@ -147,6 +147,10 @@ class CalibrateSettings(Checked):
     def __post_init__(self) -> None:
         self._keep(free=_words(self.free), known=_pairs(self.known), range=_triples(self.range))
         self._keep(start_std=_pairs(self.start_std))
+        for name in ("known", "range", "start_std"):
+            named = [row[0] for row in getattr(self, name)]
+            if twice := [one for one in dict.fromkeys(named) if named.count(one) > 1]:
+                raise ConfigurationError(f"{option(name)} names {listed(twice)} twice; give one of them")
         super().__post_init__()
         low, high = self.latency_range
         if not low < high:
@@ -172,10 +176,10 @@ class CalibrateSettings(Checked):
                 f"fit does not explain the recordings, --search {self.method} --no-refine runs it alone"
             )
         check_method(self.named())
-        for option, there in (("--starts", self.starts is not None), ("--start-std", bool(self.start_std))):
+        for flag, there in (("--starts", self.starts is not None), ("--start-std", bool(self.start_std))):
             if there and not self.in_closed_loop:
                 raise ConfigurationError(
-                    f"{option} would have no effect: {search_of(self.named())} runs no policy"
+                    f"{flag} would have no effect: {search_of(self.named())} runs no policy"
                 )
         if self.starts == "recorded" and self.start_std:
             raise ConfigurationError("--start-std would have no effect: --starts recorded moves no state")
