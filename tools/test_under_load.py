@@ -13,15 +13,19 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import re
 import subprocess
 import sys
+import tempfile
+import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 DEFAULT = ("-m", "not slow")
 BUSY = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"
 """A loop that ends with this program, however that ends."""
+LONGEST = 1000
+"""Most characters of a reason."""
 
 
 @contextlib.contextmanager
@@ -37,25 +41,43 @@ def busy_loops(count: int) -> Iterator[None]:
             loop.wait()
 
 
-def run_tests(arguments: Sequence[str], workers: int) -> tuple[int, str]:
-    """Run pytest and return its exit code and what it printed."""
-    command = [sys.executable, "-m", "pytest", "-q", "-n", f"{workers}", *arguments]
-    done = subprocess.run(
-        command,
-        # Tests that compute give way to those in real time, and to every loop: they would take hours.
-        # The summary cuts reasons at the width of the terminal.
-        env={**os.environ, "OMP_NUM_THREADS": "1", "DEAL_HW_TESTS_NICE": "0", "COLUMNS": "1000"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        check=False,
-    )
-    return done.returncode, done.stdout
+def run_tests(arguments: Sequence[str], workers: int) -> tuple[int, str, Mapping[str, str]]:
+    """Run pytest; return its exit code, what it printed, and the reason of each failure by the test."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.xml"
+        # The summary on the terminal cuts reasons at its width.
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-n",
+            f"{workers}",
+            f"--junitxml={report}",
+            *arguments,
+        ]
+        done = subprocess.run(
+            command,
+            # Tests that compute give way to those in real time, and to every loop: they would take hours.
+            env={**os.environ, "OMP_NUM_THREADS": "1", "DEAL_HW_TESTS_NICE": "0"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        found = failures(report.read_text(encoding="utf-8")) if report.exists() else {}
+    return done.returncode, done.stdout, found
 
 
-def failures(output: str) -> list[str]:
-    """Return the tests that failed or had an error, by the summary of pytest."""
-    return re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", output, re.MULTILINE)
+def failures(report: str) -> dict[str, str]:
+    """Return the reason of each failure or error by the test's name, from a report in JUnit's XML."""
+    found: dict[str, str] = {}
+    for test in ET.fromstring(report).iter("testcase"):
+        for wrong in (*test.iter("failure"), *test.iter("error")):
+            found[f"{test.get('classname')}::{test.get('name')}"] = " ".join(
+                (wrong.get("message") or "").split()
+            )
+    return found
 
 
 def main() -> int:
@@ -69,14 +91,14 @@ def main() -> int:
     bad = 0
     for number in range(given.repetitions):
         with busy_loops(given.loops):
-            code, output = run_tests(arguments or DEFAULT, given.workers)
-        failed.update(failures(output))
+            code, output, reasons = run_tests(arguments or DEFAULT, given.workers)
+        failed.update(list(reasons))
         bad += code != 0
         last = output.strip().splitlines()[-1:]
         print(f"run {number + 1}: exit code {code}: {''.join(last)}", flush=True)
-        for reason in re.findall(r"^(?:FAILED|ERROR) .+$", output, re.MULTILINE):
-            print(f"  {reason}", flush=True)
-        if code and not failures(output):
+        for name, reason in reasons.items():
+            print(f"  {name}: {reason[:LONGEST]}", flush=True)
+        if code and not reasons:
             print(output[-3000:], flush=True)
     for name, count in failed.most_common():
         print(f"failed in {count} of {given.repetitions}: {name}")

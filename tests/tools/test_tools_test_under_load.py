@@ -12,19 +12,19 @@ import test_under_load
 pytestmark = pytest.mark.real_time
 
 
-def test_failures_are_read_from_the_summary() -> None:
-    """With and without a message; a parameter may have spaces; an error of the set-up counts."""
-    printed = (
-        "FAILED tests/a.py::test_one[a b] - assert 1 == 2 - 1\n"
-        "FAILED tests/a.py::test_two\n"
-        "ERROR tests/b.py - ImportError\n"
-        "2 failed, 1 passed, 1 error in 0.1s\n"
-    )
-    assert test_under_load.failures(printed) == [
-        "tests/a.py::test_one[a b]",
-        "tests/a.py::test_two",
-        "tests/b.py",
-    ]
+def test_failures_are_read_from_the_report() -> None:
+    """A failure with its reason on one line, and an error of the set-up; what passed is none."""
+    report = """<testsuites><testsuite>
+      <testcase classname="tests.a" name="test_one[a b]">
+        <failure message="assert 1&#10; == 2">...</failure>
+      </testcase>
+      <testcase classname="tests.a" name="test_two"/>
+      <testcase classname="tests.b" name="test_three"><error message="ImportError">...</error></testcase>
+    </testsuite></testsuites>"""
+    assert test_under_load.failures(report) == {
+        "tests.a::test_one[a b]": "assert 1 == 2",
+        "tests.b::test_three": "ImportError",
+    }
 
 
 @pytest.mark.slow
@@ -42,8 +42,8 @@ def test_every_run_is_beside_the_loops_and_failures_are_counted(
     assert test_under_load.main() == 1
     reported = capsys.readouterr().out
     assert reported.count("exit code 1: 1 failed, 1 passed") == 2
-    assert reported.count("  FAILED test_it.py::test_bad - assert 1 == 2") == 2
-    assert "failed in 2 of 2: test_it.py::test_bad" in reported
+    assert reported.count("  test_it::test_bad: assert 1 == 2") == 2
+    assert "failed in 2 of 2: test_it::test_bad" in reported
     left = [p.cmdline() for p in psutil.Process().children()]
     assert [sys.executable, "-c", test_under_load.BUSY] not in left
 
