@@ -232,10 +232,9 @@ def with_unsure(problem: Problem, refined: Refined, known: Uncertainty, unsure: 
         return known
     variance = np.diag(known.covariance) + unsure[:-1] ** 2
     known = known.widened_to(np.where(known.blind, 0.0, np.sqrt(variance)))
-    reach_s = known.latency_reach_s(refined.latency_s)
     if problem.fixed_latency_s is not None:
         return known
-    wider_s = float(np.hypot(reach_s, Z90 * unsure[-1]))
+    wider_s = float(np.hypot(known.latency_reach_s(refined.latency_s), Z90 * unsure[-1]))
     return known.latency_widened_to(wider_s, refined.latency_s, problem.latency_range_s)
 
 

@@ -252,18 +252,23 @@ def unsure_shift(known: Evidence, named: Collection[str]) -> FloatArray:
     groups = [group for group in groups if group and _possible(known, [], group)]
     gains = np.array([0.0, *(known.gain([], group) for group in groups)])
     weights = np.exp((gains - gains.max()) / 2)
-    shifts = [np.zeros(len(known.prior)), *(_shift(known, [], group) for group in groups)]
+    before = known.coefficients([])
+    shifts = [np.zeros(len(known.prior)), *(_shift(known, before, group) for group in groups)]
     return np.asarray(np.sqrt(weights / weights.sum() @ np.square(shifts)))
 
 
-def _shift(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> FloatArray:
-    """Return the change of the parameters and the latency where the fit may have a group's effect, too, (P,).
+def _shift(known: Evidence, before: FloatArray, taken: Sequence[Signature]) -> FloatArray:
+    """Return the change of the parameters and the latency by further signatures, (P,).
 
     The residual is prediction minus measurement: a parameter moves against its coefficient.
+
+    Args:
+        known: The evidence.
+        before: Coefficients of a regression with some of them, (P + n,).
+        taken: All signatures.
     """
     P = len(known.prior)
-    before, after = (known.coefficients(these)[:P] for these in (taken, [*taken, *group]))
-    return before - after
+    return before[:P] - known.coefficients(taken)[:P]
 
 
 def _simplest(groups: Sequence[Sequence[Signature]], gains: Sequence[float]) -> int:
@@ -315,7 +320,7 @@ def _cause_diagnosis(
         order = [k for k in np.argsort(-gains) if gains[k] >= 0.25 * gains.max()]
         joints = [group[k].where for k in order[:4]]
         found = _diagnosis(known, cause, share, deviance, joints)
-    return dataclasses.replace(found, shift=_shift(known, taken, group))
+    return dataclasses.replace(found, shift=_shift(known, known.coefficients(taken), [*taken, *group]))
 
 
 def _diagnosis(
