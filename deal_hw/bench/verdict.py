@@ -204,7 +204,7 @@ def names(
 
 
 def _at_blind_place(kind: str, text: str) -> bool:
-    """Return whether a sentence says that the residual lies where the last joint's encoder is blind."""
+    """Return whether a sentence says that samples lack, or the residual lies, where the encoder is blind."""
     joint = re.escape(KINDS[kind].joints[-1].name)
     found = re.search(rf"lies where {joint} is between (-?[\d.]+) and (-?[\d.]+) rad", text)
     return found is not None and float(found[1]) < BLIND[1] and float(found[2]) > BLIND[0]

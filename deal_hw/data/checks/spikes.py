@@ -200,11 +200,15 @@ def sound(spikes: Sequence[Spike], count: int) -> Mask:
 
 
 def without_spikes(trajectory: Trajectory, settings: SpikeSettings = DEFAULT_SPIKES) -> Trajectory:
-    """Return a recording without the samples of spikes, as if they had been lost on the wire."""
+    """Return a recording without the samples of spikes."""
     spikes = find_spikes(trajectory.device_s, trajectory.position, position_units(trajectory), settings)
-    if not spikes:
+    return with_samples(trajectory, sound(spikes, trajectory.device_s.size))
+
+
+def with_samples(trajectory: Trajectory, kept: Mask) -> Trajectory:
+    """Return a recording with these samples only, (T,), as if the others had been lost on the wire."""
+    if kept.all():
         return trajectory
-    kept = sound(spikes, trajectory.device_s.size)
     sampled = (
         "receive_s",
         "device_s",

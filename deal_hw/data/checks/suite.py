@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deal_hw.data.checks import samples, telemetry
+from deal_hw.data.checks.blind import BlindRange, check_blind, find_blind, without_blind
 from deal_hw.data.checks.samples import OTHERS, OURS
 from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings, check_spikes, find_spikes, sound
 from deal_hw.data.table import Table, table_of
@@ -22,12 +23,17 @@ from deal_hw.findings import Finding, Severity, worst
 from deal_hw.types import FloatArray, Trajectory
 
 
-def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tuple[Finding, ...]:
+def check(
+    trajectory: Trajectory,
+    spikes: SpikeSettings = DEFAULT_SPIKES,
+    blind: Sequence[BlindRange] | None = None,
+) -> tuple[Finding, ...]:
     """Run all checks on an episode of our recorder; the order is fixed.
 
     Args:
         trajectory: The recording.
         spikes: Definition of a spike.
+        blind: Blind ranges of the robot's sensors; None: those that this recording shows.
     """
     if trajectory.device_s.size < samples.FEWEST:
         text = f"{trajectory.device_s.size} state samples"
@@ -36,6 +42,7 @@ def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tup
     if table.effort is None and "import" not in trajectory.metadata:
         # Only the file of an import may have no effort at all.
         table = dataclasses.replace(table, effort=trajectory.effort)
+    smooth = despiked(table, spikes)
     return (
         samples.check_length(table, OURS),
         samples.check_finite(table, OURS),
@@ -45,6 +52,7 @@ def check(trajectory: Trajectory, spikes: SpikeSettings = DEFAULT_SPIKES) -> tup
         telemetry.check_jitter(trajectory),
         samples.check_frozen(table, OURS),
         check_spikes(table.time_s, table.position, table.joint_names, table.units, spikes),
+        check_blind(smooth, find_blind([smooth], spikes) if blind is None else blind),
         telemetry.check_arrival(trajectory),
         telemetry.check_device_limits(trajectory),
         telemetry.check_safety_filter(trajectory),
@@ -68,11 +76,12 @@ def examine(
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
     efforts: bool = False,
+    blind: Sequence[BlindRange] | None = None,
 ) -> tuple[Finding, ...]:
     """Run all checks on a recording of unknown origin; the order is fixed.
 
-    If clock or values are unusable, the later checks are skipped: they would only repeat it. Spikes are
-    reported, and the later checks use the recording without them.
+    If clock or values are unusable, the later checks are skipped: they would only repeat it. Spikes, and what
+    a sensor holds where it is blind, are reported, and the later checks use the recording without them.
 
     Args:
         table: The recording, on its own stamps.
@@ -80,6 +89,7 @@ def examine(
         kept: The recording without the left-out parts, in which slips do no harm.
         spikes: Definition of a spike.
         efforts: Commands are efforts of motors: where they never change, the joints move by themselves.
+        blind: Blind ranges of the robot's sensors; None: those that this recording shows.
     """
     from deal_hw.data.checks import meaning
     from deal_hw.data.checks.joint_match import match
@@ -98,10 +108,13 @@ def examine(
         return (*first, rate)
     jumps = check_spikes(table.time_s, table.position, table.joint_names, table.units, spikes)
     table = despiked(table, spikes)
+    blind = find_blind([table], spikes) if blind is None else blind
+    holds, table = check_blind(table, blind), without_blind(table, blind)
     middle = (
         rate,
         samples.check_gaps(clock, 0.0, OTHERS),
         jumps,
+        holds,
         samples.check_frozen(table, OTHERS),
         speed_verdict(table),
         meaning.check_commands(table, efforts),

@@ -13,6 +13,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray, Trajectory
 
 if TYPE_CHECKING:
+    from deal_hw.data.checks.blind import BlindRange
     from deal_hw.data.table import Table
     from deal_hw.findings import Finding
     from deal_hw.sim.engine.model import RobotModel
@@ -31,6 +32,7 @@ MOTOR_CHECKS = (
     "rate",
     "gaps",
     "spikes",
+    "blind",
     "frozen",
     "velocity",
     "limits",
@@ -103,6 +105,7 @@ def examine_recording(
     servo: bool = True,
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
+    blind: Sequence[BlindRange] | None = None,
     say: Callable[[str], None],
 ) -> list[Finding]:
     """Check a recording and report problems; return the findings to keep.
@@ -114,6 +117,7 @@ def examine_recording(
         servo: Commands are positions; efforts are not compared with positions.
         kept: The recording without the left-out parts; None: all of it is used.
         spikes: Definition of a spike.
+        blind: Blind ranges of the robot's sensors; None: those that this recording shows.
         say: Called with a sentence on each finding.
 
     Raises:
@@ -127,7 +131,7 @@ def examine_recording(
     limits = None
     if facts is not None:
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    every = list(examine(table, limits, kept, spikes, efforts=not servo))
+    every = list(examine(table, limits, kept, spikes, efforts=not servo, blind=blind))
     if facts is not None and {v.code for v in every} >= {"assignment"}:
         # These checks run only if clock and values are valid.
         command = facts.command[[facts.names.index(name) for name in table.actuated]]

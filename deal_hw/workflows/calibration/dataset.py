@@ -168,25 +168,30 @@ def _provenance(dataset: Dataset, fit: Sequence[int]) -> dict[str, Any]:
 def sound_recordings(
     trajectories: Mapping[int, Trajectory], folder: Path, spikes: SpikeSettings, say: Say
 ) -> tuple[dict[int, Trajectory], list[str]]:
-    """Check episodes of a dataset and leave out their spikes.
+    """Check episodes of a dataset; leave out spikes, and values that a sensor holds where it is blind.
 
     Args:
         trajectories: By number.
         folder: The dataset, for messages.
         spikes: Definition of a spike.
-        say: Called with a sentence on each spike.
+        say: Called with a sentence on each spike and each blind range.
 
     Returns:
-        The episodes without spikes, by number, and the checks' findings in words.
+        The episodes without these samples, by number, and the checks' findings in words.
 
     Raises:
         InsufficientDataError: An episode cannot be used.
     """
-    from deal_hw.data.checks.spikes import without_spikes
+    from deal_hw.data.checks.blind import find_blind, seen
+    from deal_hw.data.checks.spikes import with_samples, without_spikes
     from deal_hw.data.checks.suite import check
+    from deal_hw.data.table import table_of
     from deal_hw.findings import Severity
 
-    verdicts = {index: check(trajectory, spikes) for index, trajectory in trajectories.items()}
+    smooth = {index: without_spikes(trajectory, spikes) for index, trajectory in trajectories.items()}
+    tables = {index: table_of(trajectory) for index, trajectory in smooth.items()}
+    blind = find_blind(tables.values(), spikes)
+    verdicts = {index: check(trajectory, spikes, blind) for index, trajectory in trajectories.items()}
     for index, found in verdicts.items():
         failed = [v.message for v in found if v.severity is Severity.FAIL]
         if failed:
@@ -194,10 +199,10 @@ def sound_recordings(
                 f"episode {index} of {folder} cannot be used: {'; '.join(failed)}; "
                 "record again with `deal-hw collect`"
             )
-        for jump in [v.message for v in found if v.code == "spikes" and v.severity is Severity.WARN][:1]:
-            say(f"episode {index}: {jump}")
+        for jump in [v for v in found if v.code in ("spikes", "blind") and v.severity is Severity.WARN]:
+            say(f"episode {index}: {jump.message}")
     lines = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
-    return {i: without_spikes(trajectory, spikes) for i, trajectory in trajectories.items()}, lines
+    return {i: with_samples(trajectory, seen(tables[i], blind)) for i, trajectory in smooth.items()}, lines
 
 
 def choose_episodes(

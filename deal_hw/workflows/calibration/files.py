@@ -42,6 +42,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
         ConfigurationError: A setting, the model or a parameter cannot be used.
         DatasetError: A recording cannot be read, understood or trusted.
     """
+    from deal_hw.data.checks.blind import find_blind, without_blind
     from deal_hw.data.checks.suite import despiked
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.engine.model import load_model
@@ -74,13 +75,15 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
         in_loop = functools.partial(policy_of_files, policy)
     description = describe(path, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
+    smooth = [[despiked(table, spikes) for table in tables] for tables in (fitted, held)]
+    blind = find_blind(itertools.chain(*smooth), spikes)
     parts = without(
-        settings.leave_out, *([despiked(table, spikes) for table in tables] for tables in (fitted, held))
+        settings.leave_out, *([without_blind(table, blind) for table in tables] for tables in smooth)
     )
     servo = description.actuation == "position"
     verdicts = {
         table.name: examine_recording(
-            table, facts, settings.force, servo=servo, kept=kept, spikes=spikes, say=say
+            table, facts, settings.force, servo=servo, kept=kept, spikes=spikes, blind=blind, say=say
         )
         for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }
