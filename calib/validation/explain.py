@@ -99,8 +99,11 @@ class Explained:
 
     @property
     def explains(self) -> bool:
-        """Whether it leaves only noise of motion that was not fitted, and less than half of the residual."""
-        return self.chi2 < MISMATCH_CHI2 and self.diagnosis.share >= DECISIVE
+        """Whether it leaves only noise of motion that was not fitted, and less than half of what is no noise.
+
+        The share of the whole squared residual would ask more of an effect the nearer to the noise it is.
+        """
+        return self.chi2 < MISMATCH_CHI2 and self.before - self.chi2 >= DECISIVE * (self.before - 1)
 
     @property
     def added(self) -> tuple[str, ...]:
