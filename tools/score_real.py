@@ -228,7 +228,7 @@ def fitted(
         laws=method == "default",
         guessed=work.guessed,
     )
-    facts = {name: result.provenance.get(name) for name in ("law", "candidates")}
+    facts = {name: result.provenance.get(name) for name in ("laws", "candidates")}
     return (
         result.space,
         result.estimate,
@@ -243,6 +243,12 @@ def fitted(
     )
 
 
+def laws_of(row: Row) -> list[str]:
+    """Return the laws of a row's result. Rows from before laws were taken on top of others have one."""
+    taken = row["laws"] if "laws" in row else [row["law"]]
+    return [str(one["law"]) for one in taken or () if one]
+
+
 def table(rows: Sequence[Row]) -> str:
     """Return errors by robot and method, as a share of the signal's range and over those without laws."""
     lines = []
@@ -252,7 +258,7 @@ def table(rows: Sequence[Row]) -> str:
         ratio, law = "", ""
         if {"default", "no-laws"} <= set(mine):
             ratio = f"{mine['default']['rmse'] / mine['no-laws']['rmse']:.3f}"
-            law = str((mine["default"]["law"] or {}).get("law", ""))
+            law = ", ".join(laws_of(mine["default"]))
         lines.append((robot, *shares, ratio, law))
     heads = ("robot", *(f"{method} [%]" for method in METHODS), "default / no-laws", "law")
     return markdown(heads, lines)

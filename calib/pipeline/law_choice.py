@@ -4,7 +4,8 @@ No simulator explains a real robot down to its sensors' noise, so a law is not a
 part of the recordings and predicts the rest. Around a fit without it, its linearised effect says little: on a
 real XL330 dry friction has taken the place of friction by load, and only a fit finds the way back. Fits with
 the best laws are candidates of the cross-validation over the motions. One is taken where it predicts every
-fold better than all fits without it do.
+fold better than all fits without it do. Then the others are asked for again, on top of it: friction by load
+hides what friction does at rest, and a robot can have both.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.problem import Member, Problem, samples_in
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.output_error import (
-    OutputErrorFit,
     Recipe,
     fit_output_error,
     prediction_errors,
@@ -43,6 +43,9 @@ from deal_hw.types import FloatArray
 MOST_LAWS = 2
 """Most laws that are fitted in the folds. A law is often about as good as another one: play and friction that
 falls with speed both delay a joint that turns round."""
+
+MOST_TAKEN = 3
+"""Most laws that a fit takes, one on top of the other."""
 
 SCREEN_ITERATIONS, FOLD_ITERATIONS, ITERATIONS = 2, 3, 6
 """Most derivatives of each fit with a law, to a part of the recordings, in a fold and to all of them. The
@@ -172,11 +175,6 @@ class LawfulChoice:
         law = next(law for law in laws if best in law.names)
         return cls(dataclasses.replace(plain, chosen=best, errors=every), law, ratios[best], lost)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON values: the choice, and the laws that lost."""
-        lost = {name: list(errors) for name, errors in self.lost.items()}
-        return self.made.to_json() | ({"lost": lost} if lost else {})
-
     def candidates(self, laws: ScreenedLaws) -> list[Candidate]:
         """Return all laws that were fitted to a part of the recordings; those of the folds by these."""
         rows, chosen = list[Candidate](), {law.explanation.name for law in laws.chosen}
@@ -192,6 +190,99 @@ class LawfulChoice:
             row = Candidate(explanation=name, judged=judged, outcome=outcome, deviance=deviance, share=share)
             rows.append(row)
         return rows
+
+
+@dataclass(frozen=True, slots=True)
+class LawsTaken:
+    """Laws that were taken one on top of the other, and the fit with all of them.
+
+    Attributes:
+        problem: The recordings, with the laws' parameters.
+        rounds: What was screened, and the choice with it, of each round; the first knows of no law.
+        member: The chosen fit to all recordings: values and latency [s]. None where no law was taken.
+    """
+
+    problem: Problem
+    rounds: Sequence[tuple[ScreenedLaws, LawfulChoice]]
+    member: Member | None = None
+
+    @property
+    def choices(self) -> list[tuple[LawCandidate, LawfulChoice]]:
+        """The laws that were taken, each with the choice that took it."""
+        return [(choice.law, choice) for _, choice in self.rounds if choice.law is not None]
+
+    @property
+    def made(self) -> Choice:
+        """The choice among all fits."""
+        return next(
+            (choice.made for _, choice in reversed(self.rounds) if choice.law), self.rounds[0][1].made
+        )
+
+    def widened(self, problem: Problem) -> Problem:
+        """Return a problem with the parameters of all laws that were taken."""
+        for law, _ in self.choices:
+            problem = law.widened(problem)
+        return problem
+
+    def findings(self, theta: FloatArray) -> list[Finding]:
+        """Return what was found of each law, with the values of the fit, (K,)."""
+        return [law.finding(choice, theta[: self._end(k)]) for k, (law, choice) in enumerate(self.choices)]
+
+    def facts(self, theta: FloatArray) -> list[dict[str, Any]]:
+        """Return each law with the error that it saves, and its values: plain JSON."""
+        return [law.facts(choice, theta[: self._end(k)]) for k, (law, choice) in enumerate(self.choices)]
+
+    def candidates(self) -> list[Candidate]:
+        """Return all laws that were fitted to a part of the recordings, each as its last round judged it."""
+        rows = dict[str, Candidate]()
+        for screened, choice in self.rounds:
+            for row in choice.candidates(screened):
+                if row.explanation not in rows or row.outcome == "taken":
+                    rows[row.explanation] = row
+        return list(rows.values())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values: the choice, and the laws that lost."""
+        lost = {name: list(errors) for _, choice in self.rounds for name, errors in choice.lost.items()}
+        return self.made.to_json() | ({"lost": lost} if lost else {})
+
+    def _end(self, number: int) -> int:
+        """Return where a law's values end among those of the fit."""
+        later = sum(len(law.more) for law, _ in self.choices[number + 1 :])
+        return len(self.problem.space) - later
+
+
+def take_laws(
+    run: CalibrationRun,
+    problem: Problem,
+    first: tuple[ScreenedLaws, LawfulChoice],
+    judged: Callable[[Problem, Sequence[LawCandidate], Choice], LawfulChoice],
+    seconds: tuple[float, float],
+) -> LawsTaken:
+    """Fit the law of a choice to all recordings, and look for others on top of it until none is taken.
+
+    Args:
+        run: The calibration.
+        problem: The recordings, without laws.
+        first: What was screened without any, and the choice.
+        judged: Compares laws of a problem in the folds with a choice without them.
+        seconds: Windows of the candidates [s].
+    """
+    found = LawsTaken(problem, [first])
+    while (law := found.rounds[-1][1].law) is not None:
+        choice = found.rounds[-1][1].made
+        run.say("fit", f"{choice.chosen} on all recordings")
+        members = law.members(found.problem, fold=False)
+        wide = law.widened(found.problem)
+        found = dataclasses.replace(found, problem=wide, member=members[choice.chosen])
+        if len(found.rounds) == MOST_TAKEN:
+            break
+        screened = screened_laws(run, wide, members[law.names[0]], seconds)
+        if not screened.chosen:
+            break
+        again = screened, judged(wide, screened.chosen, choice)
+        found = dataclasses.replace(found, rounds=[*found.rounds, again])
+    return found
 
 
 def law_errors(
@@ -238,18 +329,20 @@ def law_errors(
 
 
 def screened_laws(
-    run: CalibrationRun, problem: Problem, fit: OutputErrorFit, seconds: tuple[float, float]
+    run: CalibrationRun, problem: Problem, fit: Member, seconds: tuple[float, float]
 ) -> ScreenedLaws:
     """Fit each law to half of the recordings, and return those that predict the other better, beyond chance.
 
     Args:
         run: The calibration.
         problem: The recordings, as they are fitted.
-        fit: Their fit without a law. That of the half begins there, too, and has as many derivatives.
+        fit: Their fit without a further law: values, (K,), and latency [s]. That of the half begins there,
+            too, and has as many derivatives.
         seconds: Windows of the candidates [s]: the first are those of these fits and their predictions.
     """
     can = applicable(problem)
-    if latency_alarms(problem, fit.latency_s):
+    theta, latency_s = fit
+    if latency_alarms(problem, latency_s):
         # A latency beyond its range is the simpler explanation, and an alarm asks for it.
         can.pop(LAG, None)
     if not can:
@@ -259,14 +352,14 @@ def screened_laws(
     recipe, laws, shares = Recipe(seconds=seconds[0], iterations=SCREEN_ITERATIONS), [], dict[str, float]()
     with run.check(EXPLANATIONS):
         try:
-            without = fit_output_error(part, *fit.member, recipe).member
+            without = fit_output_error(part, *fit, recipe).member
             rms, count = _unexplained(rest, without, seconds[0])
         except InsufficientDataError:
             return ScreenedLaws()
         for law, more in can.items():
             run.say(EXPLANATIONS, f"does {law.name} predict motion that it was not fitted to?")
             wide = part.with_more(more)
-            start = np.append(fit.theta, [p.nominal for p in more]), fit.latency_s
+            start = np.append(theta, [p.nominal for p in more]), latency_s
             try:
                 member = fit_output_error(wide, *start, recipe).member
             except CalibrationError:

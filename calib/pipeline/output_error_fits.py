@@ -58,9 +58,11 @@ from deal_hw.task_map import InThisProcess
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
+    from deal_hw.calib.data.noise import Mask
     from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice
     from deal_hw.calib.validation.candidates import Diagnosed
     from deal_hw.calib.validation.checks import SplitHalf
+    from deal_hw.calib.validation.cross_validation import Choice
     from deal_hw.calib.validation.explain import Allows
 
 # What follows the fits is imported where it is used, as in stages.py.
@@ -179,7 +181,7 @@ class OutputErrorFits(Fits):
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
-        from deal_hw.calib.pipeline.law_choice import LawfulChoice, ScreenedLaws, screened_laws
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice, ScreenedLaws, screened_laws, take_laws
         from deal_hw.calib.validation import checks
         from deal_hw.calib.validation.candidates import ranked
         from deal_hw.calib.validation.cross_validation import Choice
@@ -200,22 +202,22 @@ class OutputErrorFits(Fits):
         if better:
             windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
         decided = LawfulChoice(Choice("long", {}, settings.long_s, note="without folds"))
-        laws = ScreenedLaws()
+        screened, lengths = ScreenedLaws(), (windows[0].recipe.seconds, settings.long_s)
         if run.settings.cross_validation:
-            lengths = windows[0].recipe.seconds, settings.long_s
-            laws = screened_laws(run, problem, windows[0], lengths) if self.tries_laws(run) else laws
-            decided = self._choose(run, problem, seed, (first, *windows), laws.chosen, search=better)
-        choice, law = decided.made, decided.law
-        run.say("fit", f"{choice.chosen} on all recordings")
-        if law is None:
+            if self.tries_laws(run):
+                screened = screened_laws(run, problem, windows[0].member, lengths)
+            decided = self._choose(run, problem, seed, (first, *windows), screened.chosen, search=better)
+        laws = take_laws(run, problem, (screened, decided), partial(self._with_laws, run), lengths)
+        choice = laws.made
+        if laws.member is None:
+            run.say("fit", f"{choice.chosen} on all recordings")
             searched_start = searched if better else None
             members = self._members(problem, first, windows, searched_start, choice.chosen)
+            theta, latency_s = members[choice.chosen]
         else:
-            members = law.members(problem, fold=False)
-            problem = law.widened(problem)
+            problem, (theta, latency_s) = laws.problem, laws.member
             # The local fit knows of no law.
-            run = dataclasses.replace(run, problem=law.widened(run.problem), local=None)
-        theta, latency_s = members[choice.chosen]
+            run = dataclasses.replace(run, problem=laws.widened(run.problem), local=None)
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
@@ -229,7 +231,7 @@ class OutputErrorFits(Fits):
         found: Diagnosed | None = None
         judged = run.problem, local
         with run.check(AFTER_FIT):
-            if (local is not None or law is not None) and left is not None:
+            if (local is not None or laws.choices) and left is not None:
                 # A local fit that diverged has seen only a part of the recordings.
                 lost = local is None or local.chi2 >= LOCAL_HOPELESS
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
@@ -249,20 +251,20 @@ class OutputErrorFits(Fits):
         if local is not None:
             with run.check(AFTER_FIT):
                 known, facts["physics_step"] = checks.with_step(run.problem, local, known)
-        rows = decided.candidates(laws)
+        rows = laws.candidates()
         if found is not None and judged[1] is not None:
             known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, found.causes)
             # The cross-validation has judged laws already.
-            rows += [row for row in found.candidates if row.explanation not in laws.shares]
+            rows += [row for row in found.candidates if row.explanation not in screened.shares]
         if rows:
             facts["candidates"] = [row.to_json() for row in ranked(rows)]
         pairs = confounded(problem, fit.normal.hessian / known.inflation)
-        if law is not None:
-            known = known.with_alarms(law.finding(decided, theta))
-            facts["law"] = law.facts(decided, theta)
+        if laws.choices:
+            known = known.with_alarms(*laws.findings(theta))
+            facts["laws"] = laws.facts(theta)
         names = problem.channel_names
         facts |= {
-            "cross_validation": decided.to_json(),
+            "cross_validation": laws.to_json(),
             "residual_std": dict(zip(names, map(float, first.scale), strict=True)),
             "prediction_rmse": dict(zip(names, map(float, fit.scale), strict=True)),
             "window_s": recipe.seconds,
@@ -331,17 +333,11 @@ class OutputErrorFits(Fits):
         ends in it whatever its start. Without ``search``, that on all recordings was no better start, and no
         fold is searched. Fits with laws follow, as long as they predict better than all without.
         """
-        from deal_hw.calib.pipeline.law_choice import LawfulChoice, law_errors
-        from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, on_folds, time_masks
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice
+        from deal_hw.calib.validation.cross_validation import on_folds
 
         settings, before = self.settings, problem.steps
-        motions = motion_numbers(problem.episodes)[-1] + 1
-        masks = time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
-
-        def say(fold: int, law: str = "") -> None:
-            question = f"does {law} predict it better?" if law else "which fit predicts unseen data best?"
-            run.say("cross-validation", f"{fold + 1} of {len(masks)}: {question}")
-
+        masks = _fold_masks(problem)
         # Sent to workers, so without the fits, which hold the recordings.
         fits = partial(
             dataclasses.replace(self, first=(), given=None)._of_fold,
@@ -356,9 +352,21 @@ class OutputErrorFits(Fits):
             # A search may run the policy, whose network cannot be sent.
             on = copy.copy(problem)
             on.tasks = InThisProcess()
+        say = partial(_say_fold, run, len(masks))
         found = on_folds(on, masks, fits, errors, "long", settings.long_s, say)
-        gained = {} if found.note else law_errors(problem, masks, laws, found, errors, say)
-        return LawfulChoice.of(dataclasses.replace(found, steps=problem.steps - before), laws, gained)
+        decided = LawfulChoice(found) if found.note else self._with_laws(run, problem, laws, found)
+        made = dataclasses.replace(decided.made, steps=problem.steps - before)
+        return dataclasses.replace(decided, made=made)
+
+    def _with_laws(
+        self, run: CalibrationRun, problem: Problem, laws: Sequence[LawCandidate], without: Choice
+    ) -> LawfulChoice:
+        """Compare fits with laws in the folds with those of a choice without them."""
+        from deal_hw.calib.pipeline.law_choice import LawfulChoice, law_errors
+
+        masks, errors = _fold_masks(problem), partial(_errors, seconds=self.settings.long_s)
+        gained = law_errors(problem, masks, laws, without, errors, partial(_say_fold, run, len(masks)))
+        return LawfulChoice.of(without, laws, gained)
 
     def _of_fold(
         self,
@@ -532,6 +540,19 @@ def _including(known: Uncertainty, other: FloatArray) -> Uncertainty:
     covariance = known.covariance + np.outer(apart, apart)
     interval = np.stack([np.minimum(low, other), np.maximum(high, other)], axis=1)
     return dataclasses.replace(known.with_covariance(covariance), interval=interval)
+
+
+def _fold_masks(problem: Problem) -> Sequence[Sequence[Mask]]:
+    """Return the samples of each recording that each fold leaves out; a single motion is split in time."""
+    from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
+
+    motions = motion_numbers(problem.episodes)[-1] + 1
+    return time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))
+
+
+def _say_fold(run: CalibrationRun, folds: int, fold: int, law: str = "") -> None:
+    question = f"does {law} predict it better?" if law else "which fit predicts unseen data best?"
+    run.say("cross-validation", f"{fold + 1} of {folds}: {question}")
 
 
 def _joined_stretches(problem: Problem) -> Problem:

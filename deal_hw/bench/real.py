@@ -240,7 +240,7 @@ def result_part(result: CalibrationResult, window_s: float) -> dict[str, Any]:
         "null_directions": list(result.null_directions),
         **{
             name: result.provenance.get(name)
-            for name in ("law", "cross_validation", "split_half", "confounded", "heldout_rmse")
+            for name in ("laws", "cross_validation", "split_half", "confounded", "heldout_rmse")
         },
         "estimate": dict(zip(result.space.names, map(float, result.estimate), strict=True)),
     }

@@ -17,7 +17,13 @@ from fakes.small_runs import small_run
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit
-from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice, law_errors
+from deal_hw.calib.pipeline.law_choice import (
+    LawCandidate,
+    LawfulChoice,
+    LawsTaken,
+    ScreenedLaws,
+    law_errors,
+)
 from deal_hw.calib.pipeline.output_error_fits import BRIEF, OutputErrorFits
 from deal_hw.calib.pipeline.stages import (
     CalibrationPipeline,
@@ -36,9 +42,11 @@ from deal_hw.calib.validation.explanations import PLAY as PLAY_LAW
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
 from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.testing import plain_effects
 from deal_hw.testing.plain_faults import (
     ASYMMETRY,
     ENCODER_SCALE,
+    LAG_S,
     LAWS,
     LOAD_FRICTION,
     PLAY,
@@ -47,6 +55,8 @@ from deal_hw.testing.plain_faults import (
 )
 from deal_hw.testing.plain_robots import make_robot
 from deal_hw.workflows.calibration.run import calibrate_episodes
+
+STRIBECK_LAW = next(law for law in EXPLANATIONS if law.name == "friction that falls with speed")
 
 
 @pytest.mark.slow
@@ -224,9 +234,9 @@ def test_a_law_is_taken_for_what_it_predicts(fault: Fault | None, law: str | Non
     assert len(found.estimate) == len(found.space) and found.space.names[:K] == problem.space.names
     folds = found.provenance["cross_validation"]["errors"]
     if law is None:
-        assert "law" not in found.provenance and len(found.space) == K
+        assert "laws" not in found.provenance and len(found.space) == K
         return
-    of = found.provenance["law"]
+    (of,) = found.provenance["laws"]
     assert of["law"] == law and f"long, {law}" in folds
     assert max(of["error_ratio"]) < 0.9
     assert found.space.names[K:] == tuple(of["values"]) and len(of["values"]) == 4
@@ -234,6 +244,25 @@ def test_a_law_is_taken_for_what_it_predicts(fault: Fault | None, law: str | Non
     assert found.population is None
     (alarm,) = [one for one in found.alarms if "falls with speed" in one.seen]
     assert "elbow.friction_stribeck" in alarm.do
+
+
+@pytest.mark.slow
+def test_two_laws_are_taken_one_on_top_of_the_other(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A servo that lags, and whose friction is larger at rest: neither law alone is enough."""
+    monkeypatch.setitem(plain_effects.FORCES, "lag", plain_effects.FORCES["friction"])
+    problem = problem_of(make_robot("pendulum", 3, "lag"), tmp_path, seconds=6.0)
+    method = CalibrationPipeline(
+        Eki(), "output-error", Validation(local_first=False, split_half=False), fits=OutputErrorFits()
+    )
+    found = method.run(problem, Budget(population=20, generations=4), np.random.default_rng(0))
+    first, second = found.provenance["laws"]
+    assert (first["law"], second["law"]) == ("friction that falls with speed", "drives that lag")
+    assert max(first["error_ratio"]) < 0.8 and max(second["error_ratio"]) < 0.6
+    values = dict(zip(found.space.names, found.estimate, strict=True))
+    assert values["pivot.lag"] == second["values"]["pivot.lag"] == pytest.approx(LAG_S, rel=0.02)
+    assert values["pivot.friction_stribeck"] == first["values"]["pivot.friction_stribeck"] > 0.05
+    named = [one for one in found.alarms if "left out is" in one.seen]
+    assert len(named) == 2 and "pivot.lag" in named[1].do
 
 
 @pytest.mark.slow
@@ -248,10 +277,10 @@ def test_a_law_is_taken_after_a_refinement_far_from_the_noise(
     _, problem, fit = truth(kind, fault)
     run = small_run(problem)
     found = BRIEF.continued(run, without_search(problem, run.budget, fit), fit)
-    assert found.facts.get("law", {}).get("law") == law
+    assert [one["law"] for one in found.facts.get("laws", ())] == ([law] if law else [])
     assert len(found.theta) == len(problem.space) + (2 if law else 0)
     if law is not None:
-        assert max(found.facts["law"]["error_ratio"]) < 0.6
+        assert max(found.facts["laws"][0]["error_ratio"]) < 0.6
 
 
 def test_only_a_residual_far_from_the_noise_is_fitted_by_predictions() -> None:
@@ -309,11 +338,42 @@ def test_a_law_must_predict_every_fold() -> None:
     plain = Choice("long", {"short": (3.0, 1.9), "long": (2.0, 2.0)}, 2.0)
     mixed = LawfulChoice.of(plain, [law], {short: [2.5], long: [1.0, 1.95]})
     assert mixed.law is None and mixed.made == plain
-    assert mixed.to_json()["lost"] == {short: [2.5], long: [1.0, 1.95]}
+    assert mixed.lost == {short: (2.5,), long: (1.0, 1.95)}
     won = LawfulChoice.of(plain, [law], {short: [2.5], long: [1.0, 1.52]})
     assert won.law is law and won.ratios == pytest.approx([0.5, 0.8])
     assert won.made.chosen == long and set(won.made.errors) == {"short", "long", long}
     assert LawfulChoice.of(plain, [], {}) == LawfulChoice(plain)
+
+
+def test_values_of_laws_stand_in_the_order_in_which_they_were_taken(
+    small_problem: Callable[..., Problem],
+) -> None:
+    """Two laws with one and two parameters: each finding and each fact has its own values."""
+    problem = small_problem()
+    K = len(problem.space)
+    lag = [Parameter.from_zero("a.lag", "command_lag", (problem.robot.actuator_names[0],), "s", 0.005, 0.1)]
+    joint = problem.robot.description.joint_names[:1]
+    fall = Parameter.friction_at_rest("a", joint, 0.1)
+    start = problem.space.nominal, 0.0
+    first = LawCandidate(PLAY_LAW, lag, (0.4, 2.0), start)
+    second = LawCandidate(STRIBECK_LAW, fall, (0.4, 2.0), start)
+    plain = Choice("long", {"long": (2.0, 2.0)}, 2.0)
+    one = LawfulChoice.of(plain, [first], {first.names[1]: [1.0, 1.0]})
+    two = LawfulChoice.of(one.made, [second], {second.names[0]: [0.9, 0.9]})
+    none = LawfulChoice(two.made, lost={"other": (3.0,)})
+    rounds = [(ScreenedLaws(), choice) for choice in (one, two, none)]
+    wide = second.widened(first.widened(problem))
+    taken = LawsTaken(wide, rounds, start)
+    assert taken.made.chosen == second.names[0] and taken.to_json()["lost"] == {"other": [3.0]}
+    assert taken.widened(problem).space.names == wide.space.names
+    theta = np.arange(K + 3.0)
+    facts = taken.facts(theta)
+    assert [fact["values"] for fact in facts] == [
+        {"a.lag": K},
+        {"a.friction_stribeck": K + 1.0, "a.stribeck_speed": K + 2.0},
+    ]
+    assert [fact["error_ratio"] for fact in facts] == [[0.5, 0.5], [0.9, 0.9]]
+    assert "50 % lower" in taken.findings(theta)[0].seen and "10 % lower" in taken.findings(theta)[1].seen
 
 
 def test_a_law_that_loses_a_fold_is_fitted_to_no_other(

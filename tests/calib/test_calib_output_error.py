@@ -198,7 +198,7 @@ def test_the_method_lets_motions_it_has_not_fitted_choose(result: CalibrationRes
     folds = result.provenance["cross_validation"]
     assert set(folds["errors"]) >= CANDIDATES
     assert all(len(errors) == 2 for errors in folds["errors"].values())
-    assert folds["chosen"] in CANDIDATES - {"long, no latency"} and "law" not in result.provenance
+    assert folds["chosen"] in CANDIDATES - {"long, no latency"} and "laws" not in result.provenance
     assert result.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
     assert np.all(result.interval[:, 0] <= TRUTH) and np.all(result.interval[:, 1] >= TRUTH)
     assert result.latency_s == pytest.approx(LATE_S, abs=2e-3)
@@ -234,7 +234,7 @@ def test_fits_come_before_the_search_which_is_a_candidate_if_it_is_a_better_star
     assert offered[1][1] == pytest.approx(TRUTH[0], rel=0.03)
     errors = found.provenance["cross_validation"]["errors"]
     assert set(errors) >= (CANDIDATES - {"0.8 s", "1.2 s"}) | {"search"} and "0.8 s" not in errors
-    assert "law" not in found.provenance
+    assert "laws" not in found.provenance
     assert found.estimate[0] == pytest.approx(TRUTH[0], rel=0.03)
 
 

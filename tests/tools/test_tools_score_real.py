@@ -55,12 +55,14 @@ def test_the_table_compares_the_default_with_and_without_laws() -> None:
             "error": "",
             "share": 0.018,
             "rmse": 0.0036,
-            "law": {"law": "friction"},
+            "laws": [{"law": "friction"}, {"law": "play"}],
         },
         {"robot": "so101", "method": "mujoco-sysid", "error": "no"},
     ]
     last = score_real.table(rows).splitlines()[-1]
-    assert last == "| so101 | | | | 2.000 | 1.800 | 0.900 | friction |"
+    assert last == "| so101 | | | | 2.000 | 1.800 | 0.900 | friction, play |"
+    assert score_real.laws_of({"law": {"law": "friction"}}) == ["friction"]
+    assert score_real.laws_of({"law": None}) == score_real.laws_of({"laws": None}) == []
 
 
 def test_unknown_robots_and_methods_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

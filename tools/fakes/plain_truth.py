@@ -19,9 +19,9 @@ from deal_hw.workflows.calibration.settings import FilesSettings
 Truth = tuple[PlainRobot, Problem, Refined]
 
 
-def problem_of(robot: PlainRobot, folder: Path) -> Problem:
-    """Return the problem of two recordings of 3 s of a robot."""
-    model, paths, held_out = write(robot, folder, seconds=3.0)
+def problem_of(robot: PlainRobot, folder: Path, seconds: float = 3.0) -> Problem:
+    """Return the problem of two recordings of a robot, of 3 s or another length [s]."""
+    model, paths, held_out = write(robot, folder, seconds=seconds)
     work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
     return Problem(work.robot, work.space, work.episodes, threads=1)
 
