@@ -49,7 +49,7 @@ MOST_SCALE = 1.5
 """Largest factor by which an encoder is tried to report more or less [-]."""
 
 FIRST_SHARE = 0.3
-"""Further friction at rest from which a fit begins, as a share of the friction in motion [-]."""
+"""How much more or less friction at rest a fit begins with, as a share of that in motion [-]."""
 
 SPEEDS = (0.01, 1.0)
 """Least and largest Stribeck speed that is tried, in rms speeds of the joint [-]. A faster one cannot be told
@@ -89,7 +89,16 @@ def _play(problem: Problem) -> list[Parameter]:
     ]
 
 
-def _stribeck(problem: Problem) -> list[Parameter]:
+def _falling(problem: Problem) -> list[Parameter]:
+    return _by_speed(problem, 1)
+
+
+def _rising(problem: Problem) -> list[Parameter]:
+    return _by_speed(problem, -1)
+
+
+def _by_speed(problem: Problem, sign: int) -> list[Parameter]:
+    """Return dry friction that is larger, or smaller, at rest than in motion."""
     if _searched(problem, "dof_friction_stribeck"):
         return []
     model, found, speeds = problem.robot.model, [], []
@@ -98,13 +107,14 @@ def _stribeck(problem: Problem) -> list[Parameter]:
         if coulomb <= 0 or speed <= 0:
             # Without dry friction in the model that comes first.
             continue
-        most = max(MOST_FORCE * push, MOST_FORCE * coulomb)
+        most = sign * max(MOST_FORCE * float(push), MOST_FORCE * coulomb)
+        first = sign * FIRST_SHARE * coulomb
         found.append(
-            _parameter(problem, "dof_friction_stribeck", name, FIRST_SHARE * coulomb, 0.0, float(most))
+            _parameter(problem, "dof_friction_stribeck", name, first, min(most, 0.0), max(most, 0.0))
         )
-        first = float(np.clip(STRIBECK_SPEED, 2 * SPEEDS[0] * speed, 0.5 * SPEEDS[1] * speed))
+        first_speed = float(np.clip(STRIBECK_SPEED, 2 * SPEEDS[0] * speed, 0.5 * SPEEDS[1] * speed))
         ends = SPEEDS[0] * float(speed), SPEEDS[1] * float(speed)
-        speeds.append(_parameter(problem, "dof_stribeck_speed", name, first, *ends, scale="log"))
+        speeds.append(_parameter(problem, "dof_stribeck_speed", name, first_speed, *ends, scale="log"))
     return [*found, *speeds]
 
 
@@ -216,9 +226,18 @@ EXPLANATIONS: Sequence[Explanation] = (
     Explanation(
         "friction that falls with speed",
         "friction",
-        _stribeck,
+        _falling,
         "Dry friction is larger at rest than in motion (Stribeck). That of MuJoCo is constant.",
         "Free dof_friction_stribeck and dof_stribeck_speed of {} (--parameters).",
+        "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    ),
+    Explanation(
+        "friction that rises with speed",
+        "friction",
+        _rising,
+        "Dry friction is smaller at rest than in motion, so friction grows less than in proportion to speed, "
+        "as in harmonic drives. That of MuJoCo is a constant and a straight line.",
+        "Free dof_friction_stribeck, below 0, and dof_stribeck_speed of {} (--parameters).",
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
     Explanation(

@@ -395,8 +395,8 @@ class Verdict(SearchingBench, SpreadBench):
     """Robots, comma separated; by default all: pendulum, double-pendulum, arm, cart-pole, leg."""
 
     faults: Faults = ()
-    """Faults, comma separated; by default none and all of these: friction, load-friction, backlash,
-    motor-play, lag, free-speed, servo-dead-zone, motor-dead-zone, motor-asymmetry, encoder-scale,
+    """Faults, comma separated; by default none and all of these: friction, load-friction, friction-rise,
+    backlash, motor-play, lag, free-speed, servo-dead-zone, motor-dead-zone, motor-asymmetry, encoder-scale,
     blind-encoder, zeros, jitter, mass, sign. encoders: a right model with encoders. Faults of recordings that
     commands and measurements share: mirrored, swapped, fast-clock, slow-clock, degrees, doubled,
     doubled-joint; these calibrations end as soon as they have named the fault. A robot is left out where a

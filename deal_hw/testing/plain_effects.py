@@ -22,11 +22,15 @@ from deal_hw.testing.plain_faults import (
     MOST_ZERO,
     MOTOR_DEAD_ZONE,
     PLAY,
+    RISE,
     SERVO_DEAD_ZONE,
     STRIBECK_EXTRA,
     STRIBECK_SPEED,
 )
 from deal_hw.types import FloatArray
+
+LEAST_FRICTION = 1e-9
+"""MuJoCo has no friction constraint at 0, and the number of constraints has to stay [N·m or N]."""
 
 TURN = 1e-3
 """Angle to either side over which the rise of gravity's torque is taken [rad or m]."""
@@ -180,6 +184,11 @@ def _load_friction(plant: Plant) -> None:
     plant.model.dof_frictionloss[plant.dof] = plant.coulomb + LOAD_FRICTION * torque
 
 
+def _friction_rise(plant: Plant) -> None:
+    rising = plant.coulomb * np.abs(np.tanh(RISE * plant.speed))
+    plant.model.dof_frictionloss[plant.dof] = np.maximum(rising, LEAST_FRICTION)
+
+
 def _free_speed(plant: Plant) -> None:
     """Limit torques as a DC motor on a limited voltage does, whose back-EMF grows with speed."""
     lost = plant.speed / FREE_SPEED
@@ -216,6 +225,7 @@ COMMANDS: Mapping[str, Callable[[Plant, FloatArray], FloatArray]] = {
 FORCES: Mapping[str, Callable[[Plant], None]] = {
     "friction": _stribeck,
     "load-friction": _load_friction,
+    "friction-rise": _friction_rise,
     "free-speed": _free_speed,
 }
 """What changes forces before each physics step, by fault."""

@@ -9,6 +9,7 @@ from typing import Literal
 Fault = Literal[
     "friction",
     "load-friction",
+    "friction-rise",
     "backlash",
     "motor-play",
     "lag",
@@ -31,6 +32,7 @@ SharedFault = Literal[
 FAULTS: Mapping[Fault, str] = {
     "friction": "dry friction is four times as high at rest and falls with speed (Stribeck)",
     "load-friction": "dry friction grows by a fifth of the motor's torque",
+    "friction-rise": "dry friction is 0 at rest and rises with speed (tanh), as in a harmonic drive",
     "backlash": "a gear with a play of 0.06 rad between servo and joint",
     "motor-play": "a gear with a play of 1 degree in the last joint, behind the motor's encoder of 12 bits",
     "lag": "servos follow their set-points with a first-order lag of 30 ms",
@@ -60,6 +62,9 @@ WITH_MOTORS = ("motor-dead-zone", "motor-asymmetry")
 
 WITH_STEPS = ("free-speed",)
 """Robots whose set-points have steps: a servo that never saturates has its full torque at every speed."""
+
+TURNING = ("free-speed", "friction-rise")
+"""Faults of drives that turn: their sizes are in radians."""
 
 SHARED: Mapping[SharedFault, tuple[str, ...]] = {
     "mirrored": (
@@ -92,6 +97,7 @@ CAUSES: Mapping[Fault, tuple[str, ...]] = {
 
 LAWS: Mapping[Fault, tuple[str, ...]] = {
     "load-friction": ("friction that grows with the motor's torque", "friction that grows with load"),
+    "friction-rise": ("friction that rises with speed",),
     "lag": ("drives that lag",),
     "free-speed": ("effort that falls with speed",),
     "servo-dead-zone": ("servos with a dead zone",),
@@ -124,6 +130,11 @@ COARSE_S = 0.002
 LOAD_FRICTION = 0.2
 """Dry friction a motor torque [-]. Identified servos have 0.198 (MX-106), 0.267 (XL330) and 0.311 (MX-64):
 model M6 of BAM, commit 1b5a1cee, bam/params."""
+
+RISE = 5.1181 / 2
+"""Factor of the speed in the hyperbolic tangent of friction that rises with it [s/rad or s/m]: half of phi_2
+of the first joint of a Franka Emika Panda, whose friction is a sigmoid (Gaz et al., "Dynamic Identification
+of the Franka Emika Panda Robot", 2019). Its other joints have up to 17.1 / 2."""
 
 LAG_S = 0.03
 """Time constant of a servo's set-point [s]: the shortest smoothing time (lookahead_time of servoj, 0.03 to

@@ -25,6 +25,7 @@ from deal_hw.testing.plain_faults import (
     SHARED,
     STEP,
     STEP_S,
+    TURNING,
     WITH_ENCODERS,
     WITH_MOTORS,
     WITH_STEPS,
@@ -294,8 +295,8 @@ def can_have(kind: str, fault: str | None) -> bool:
     """Return whether a fault makes sense for a robot.
 
     Swapped joints need two of one type, a doubled joint another one beside it. Motors need a robot that
-    hangs. A servo with a free speed turns. In the loop of a servo an encoder's scale looks as other gains and
-    inertias do, so it is that of a joint without a motor.
+    hangs. A servo with a free speed turns, and so does a harmonic drive. In the loop of a servo an encoder's
+    scale looks as other gains and inertias do, so it is that of a joint without a motor.
     """
     joints = KINDS[kind].joints
     if fault == "swapped":
@@ -304,7 +305,7 @@ def can_have(kind: str, fault: str | None) -> bool:
         return len(joints) > 1
     if fault in WITH_MOTORS:
         return all(joint.effort for joint in joints if joint.kp)
-    if fault in WITH_STEPS:
+    if fault in TURNING:
         return ":slide" not in KINDS[kind].bodies
     return fault != "encoder-scale" or not joints[-1].kp
 

@@ -70,6 +70,16 @@ def test_friction_by_load_is_a_fifth_of_the_torque() -> None:
     assert robot.model.dof_frictionloss[0] == pytest.approx(coulomb + LOAD_FRICTION * held, rel=1e-3)
 
 
+@pytest.mark.parametrize(("speed", "share"), [(0.0, 0.0), (0.2, 0.47135), (-2.0, 0.99993)])
+def test_friction_rises_with_speed(speed: float, share: float) -> None:
+    """As on a Panda's first joint: tanh(2.559 * 0.2) is 0.4714 of the friction at speed; none at rest."""
+    robot = plant("pendulum", "friction-rise")
+    coulomb = make_robot("pendulum", 0).truth["pivot.frictionloss"]
+    robot.data.qvel[0] = speed
+    robot.step(np.zeros(1))
+    assert robot.model.dof_frictionloss[0] == pytest.approx(share * coulomb, rel=1e-4, abs=1e-8)
+
+
 @pytest.mark.parametrize(("speed", "share"), [(0.0, 1.0), (FREE_SPEED / 2, 0.5), (-FREE_SPEED / 2, 1.5)])
 def test_a_servo_on_a_limited_voltage_loses_torque_with_speed(speed: float, share: float) -> None:
     """The stall torque, 0.18 rad * 4 N·m/rad, at rest; half of it at half the free speed; more against it."""

@@ -7,6 +7,7 @@ M5, arXiv 2410.08650). With the torque of the motor m and that from outside e, a
 
 Their exponent of s is free. It trades with ws and Kcs, and 2 is what MuJoCo's LuGre element has. A joint at
 rest that a motor holds has e = -m. So with Ke = Km = K its friction is 2 K times the torque it transmits.
+With Kcs below 0 friction rises with speed, as in harmonic drives. Whoever applies a budget keeps it above 0.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class FrictionLaw:
 
     Attributes:
         coulomb: Kc, friction at speed, without load [N·m or N].
-        stribeck: Kcs, further friction at rest [N·m or N].
+        stribeck: Kcs, further friction at rest, or less if negative [N·m or N].
         stribeck_speed: ws, speed at which that has fallen to 1/e [rad/s or m/s].
         motor: Km, friction a motor torque [-].
         external: Ke, friction an outside torque [-].

@@ -49,7 +49,7 @@ _INTEGRATORS = ("Euler", "implicit", "implicitfast")
 """Integrators that hold a servo's effort against its position for a whole step."""
 
 
-def _friction(name: str, *, quantity: str, unit: str, slide: str, along: str) -> Kind:
+def _friction(name: str, *, quantity: str, unit: str, slide: str, along: str, least: float = 0.0) -> Kind:
     return Kind(
         name=name,
         element="joint",
@@ -62,6 +62,7 @@ def _friction(name: str, *, quantity: str, unit: str, slide: str, along: str) ->
         baseline=None,
         usable=one_dof_joint,
         ratio=FRICTION_RATIO,
+        least=least,
     )
 
 
@@ -128,7 +129,8 @@ LAW_KINDS = (
         quantity="friction_stribeck",
         unit="N·m",
         slide="N",
-        along="dry friction at rest is larger by it than dof_frictionloss",
+        along="dry friction at rest is larger by it than dof_frictionloss; smaller, if it is negative",
+        least=float("-inf"),
     ),
     _friction(
         "dof_stribeck_speed",
