@@ -17,13 +17,14 @@ Of each row it reads (CSV, or NPZ arrays of the same names):
     actualMotorSave  pulse width as sent to the motor, +-4307.69 at full power; positive pulls to the left
     Q, angle         normalised motor power, and the angle by the log's own scale [rad]; for --as-logged
 
-The potentiometer does not read as the log says. Hanging still is at 1209.82 counts, and a count is 0.001467
-rad (swings of a known centre, both sides of the blind angle), where the log has 2 pi / 4096. Over about 0.26
-rad the slider touches nothing: the first and the last counts, below 8 and above 4086, are no angles, and
-their rows are left out. So is a last reading before them that the sensor holds. The angle is unwrapped; 0 is
-upright, as in the model. `--keep-gap` keeps these rows: the gap is from -5.19 to -4.92 rad, and a calibration
-shows that much of its residual lies there. `--as-logged` keeps the log's angle instead, which wraps at +-pi,
-all rows, and the normalised command: what `deal-hw data import` says of these is worth reading.
+The potentiometer does not read as the log says. Hanging still is at 1209.82 counts, and a count is
+0.001467 rad (swings of a known centre, both sides of the blind angle), where the log has 2 pi / 4096. Over
+about 0.26 rad the slider touches nothing: the first and the last counts, below 8 and above 4086, are no
+angles, and their rows are left out. So is a last reading before them that the sensor holds. The angle is
+unwrapped; 0 is upright, as in the model. `--keep-gap` keeps these rows: the gap is from -5.19 to -4.92
+rad, and the check `blind` of a calibration finds it and leaves its samples out. `--as-logged` keeps the
+log's angle instead, which wraps at +-pi, all rows, and the normalised command: what `deal-hw data import`
+says of these is worth reading.
 
 Calibrate and import as the recordings of any robot:
 

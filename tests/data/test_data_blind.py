@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.data.checks.blind import CROSSINGS, BlindRange, check_blind, find_blind, seen, without_blind
-from deal_hw.data.checks.suite import examine
+from deal_hw.data.checks.spikes import DEFAULT_SPIKES
+from deal_hw.data.checks.suite import check, examine
 from deal_hw.data.table import Table
 from deal_hw.findings import Severity
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, Trajectory
+from deal_hw.workflows.calibration.dataset import sound_recordings
 
 RATE_HZ = 100.0
 TIME_S = np.arange(1000) / RATE_HZ
@@ -207,3 +211,27 @@ def test_checks_see_the_recording_without_held_values() -> None:
     assert {one.code: one.severity for one in examine(recording(0.1 * SLOW), blind=[given_range])}[
         "blind"
     ] is Severity.OK
+
+
+def test_episodes_of_a_dataset_lose_their_held_samples(
+    make_trajectory: Callable[..., Trajectory], tmp_path: Path
+) -> None:
+    """One episode shows the range; a second one, which comes there once, loses its samples, too."""
+    clean = make_trajectory()
+    time_s = clean.device_s
+    swings = np.cos(5 * time_s) * (1 - 0.1 * time_s)
+    one, other = (
+        make_trajectory(position=np.stack([clean.position[:, 0], held(pole, 0.2, 0.5)], axis=1))
+        for pole in (swings, 0.4 * swings)
+    )
+    assert {v.code for v in check(one) if v.severity is not Severity.OK} == {"blind"}
+    assert not [v for v in check(other) if v.code == "blind" and v.severity is not Severity.OK]
+    said: list[str] = []
+    kept, lines = sound_recordings({0: one, 3: other}, tmp_path, DEFAULT_SPIKES, said.append)
+    for number, pole in ((0, swings), (3, 0.4 * swings)):
+        rows = np.isin(time_s, kept[number].device_s)
+        assert not np.any(rows & (pole > 0.2) & (pole < 0.5))
+        assert 0.7 * np.mean((pole < 0.2) | (pole > 0.5)) < np.mean(rows) < 0.95
+        assert np.array_equal(kept[number].sent_s, clean.sent_s)
+    assert [line.split(": ")[0] for line in said] == ["episode 0", "episode 3"]
+    assert sum("no sample lies where pole" in line for line in lines) == 2
