@@ -188,7 +188,7 @@ def _noise(position: FloatArray) -> float:
     if position.size < 4:
         return 0.0
     # The variance of white noise grows by 1 + 9 + 9 + 1.
-    return float(np.median(np.abs(np.diff(position, 3)))) / (NORMAL_MEDIAN * np.sqrt(20.0))
+    return float(np.median(np.abs(np.diff(position, 3))) / (NORMAL_MEDIAN * np.sqrt(20.0)))
 
 
 def _jumps(
@@ -198,7 +198,7 @@ def _jumps(
     speed = step / np.diff(time_s)
     far = (step > settings.least[unit]) & (step <= WIDEST[unit]) & (speed > settings.speed[unit])
     kept, around, faster = [], [], []
-    for at in np.flatnonzero(far):
+    for at in map(int, np.flatnonzero(far)):
         beside = np.r_[max(at - AROUND, 0) : at, at + 1 : min(at + 1 + AROUND, len(step))]
         later = position[min(at + 1 + AROUND, len(step))] - position[at + 1]
         goes_on = later * np.sign(position[at + 1] - position[at]) > NOISES * noise
