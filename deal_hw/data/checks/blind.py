@@ -53,7 +53,6 @@ NOISES: Final = 5.0
 WIDEST: Final = {"rad": np.pi, "m": 1.0}
 """Widest range that is looked for [rad or m]: angles that turn over jump by about 2 pi."""
 
-
 NORMAL_MEDIAN: Final = 0.6745
 """Median size of a value of the standard normal distribution [-]."""
 
@@ -87,7 +86,8 @@ class BlindRange:
         low, high = self.held
         at = _within_turn(position, (self.low + self.high) / 2) if self.turns else position
         found = (at >= low) & (at <= high)
-        then = at[:-1] + np.diff(position)
+        with np.errstate(over="ignore", invalid="ignore"):
+            then = at[:-1] + np.diff(position)
         found[:-1] |= (at[:-1] <= self.low) & (then >= self.high)
         found[:-1] |= (at[:-1] >= self.high) & (then <= self.low)
         return np.asarray(found)
