@@ -170,14 +170,9 @@ def describe(spikes: Sequence[Spike], time_s: FloatArray, joints: Sequence[str],
 
 
 def check_spikes(
-    time_s: FloatArray,
-    position: FloatArray,
-    joints: Sequence[str],
-    units: Sequence[str],
-    settings: SpikeSettings = DEFAULT_SPIKES,
+    found: Sequence[Spike], time_s: FloatArray, joints: Sequence[str], units: Sequence[str]
 ) -> Finding:
-    """Check for samples that jump away and come back; arguments as of :func:`find_spikes`."""
-    found = find_spikes(time_s, position, units, settings)
+    """Judge the spikes of a recording; stamps, joints and units as of :func:`find_spikes`."""
     if not found:
         return Finding("spikes", Severity.OK, "no position jumps away and comes back")
     count = len({row for spike in found for row in spike.rows})

@@ -16,7 +16,14 @@ import numpy as np
 from deal_hw.data.checks import samples, telemetry
 from deal_hw.data.checks.blind import BlindRange, check_blind, find_blind, without_blind
 from deal_hw.data.checks.samples import OTHERS, OURS
-from deal_hw.data.checks.spikes import DEFAULT_SPIKES, SpikeSettings, check_spikes, find_spikes, sound
+from deal_hw.data.checks.spikes import (
+    DEFAULT_SPIKES,
+    Spike,
+    SpikeSettings,
+    check_spikes,
+    find_spikes,
+    sound,
+)
 from deal_hw.data.table import Table, table_of
 from deal_hw.errors import DatasetError
 from deal_hw.findings import Finding, Severity, worst
@@ -42,7 +49,8 @@ def check(
     if table.effort is None and "import" not in trajectory.metadata:
         # Only the file of an import may have no effort at all.
         table = dataclasses.replace(table, effort=trajectory.effort)
-    smooth = despiked(table, spikes)
+    found = find_spikes(table.time_s, table.position, table.units, spikes)
+    smooth = _without(table, found)
     return (
         samples.check_length(table, OURS),
         samples.check_finite(table, OURS),
@@ -51,7 +59,7 @@ def check(
         telemetry.check_lost_frames(trajectory),
         telemetry.check_jitter(trajectory),
         samples.check_frozen(table, OURS),
-        check_spikes(table.time_s, table.position, table.joint_names, table.units, spikes),
+        check_spikes(found, table.time_s, table.joint_names, table.units),
         check_blind(smooth, find_blind([smooth], spikes) if blind is None else blind),
         telemetry.check_arrival(trajectory),
         telemetry.check_device_limits(trajectory),
@@ -106,8 +114,9 @@ def examine(
     rate = samples.check_rate(clock)
     if rate.severity is Severity.FAIL:
         return (*first, rate)
-    jumps = check_spikes(table.time_s, table.position, table.joint_names, table.units, spikes)
-    table = despiked(table, spikes)
+    found = find_spikes(table.time_s, table.position, table.units, spikes)
+    jumps = check_spikes(found, table.time_s, table.joint_names, table.units)
+    table = _without(table, found)
     blind = find_blind([table], spikes) if blind is None else blind
     holds, table = check_blind(table, blind), without_blind(table, blind)
     middle = (
@@ -147,7 +156,10 @@ def nominal_period_s(trajectory: Trajectory) -> float:
 
 def despiked(table: Table, settings: SpikeSettings) -> Table:
     """Return a recording without the samples that jump and come back, see :class:`SpikeSettings`."""
-    found = find_spikes(table.time_s, table.position, table.units, settings)
+    return _without(table, find_spikes(table.time_s, table.position, table.units, settings))
+
+
+def _without(table: Table, found: Sequence[Spike]) -> Table:
     return table.rows(sound(found, table.time_s.size)) if found else table
 
 
