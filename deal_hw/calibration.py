@@ -20,6 +20,8 @@ from deal_hw.types import FloatArray
 
 LATENCY_RANGE_S = (0.0, 0.04)
 """Default range of the latency search [s]."""
+LATENCY = "latency"
+"""Name of the latency among the values of a fit."""
 Z90 = 1.6448536269514722
 """A standard normal lies within +- this with 90 % probability."""
 EXPLAINED_CHI2 = 1.3

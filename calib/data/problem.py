@@ -195,7 +195,7 @@ class Problem:
             they begin in the recorded first state.
         tasks: Does fits that do not depend on each other; see :mod:`deal_hw.calib.data.independent`.
         engine: What simulates the populations of searches; all else is simulated by MuJoCo, in float64.
-        guessed: Names of the parameters whose range nobody chose. It may grow where the data ask for it.
+        guessed: Parameters whose range nobody chose, "latency" too. It may grow where the data ask for it.
         command_delays: Random delays of commands that fits allow for; None for a constant delay. They belong
             to single commands of these recordings: a problem of others begins without.
         efforts: Columns of the joints whose recorded effort is compared, (E,).

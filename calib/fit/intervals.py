@@ -35,13 +35,16 @@ from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.fit.unexplained import Unexplained, as_one, autocorrelated
 from deal_hw.calibration import EXPLAINED_CHI2, Z90, Identifiability, listed
 from deal_hw.findings import Finding
-from deal_hw.parameters import ParameterSpace
+from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
 from deal_hw.sim.parameters import find_kind
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
     from deal_hw.calib.fit.output_error import OutputErrorFit
 
+
+LATENCY_AT_END = 0.01
+"""Distance to an end of the latency range, as a share of it, that counts as at the end [-]."""
 
 MISMATCH_CHI2 = EXPLAINED_CHI2
 """Mean squared residual over the noise variance above which the model is wrong [-]."""
@@ -297,6 +300,23 @@ def pressed_ends(space: ParameterSpace, theta: FloatArray, slope: FloatArray) ->
     """Return -1 or 1 where a parameter ended at a bound that the data press, (K,)."""
     side = np.where(space.normalize(theta) < 0.5, -1, 1)
     return np.asarray(side * (ended_at_bound(space, theta) & (side * slope <= 0)))
+
+
+def latency_end(problem: Problem, latency_s: float, searched_s: tuple[float, float]) -> int:
+    """Return at which end of its range a searched latency ended: -1, 1, or 0 for none; zero is no end."""
+    if problem.fixed_latency_s is not None:
+        return 0
+    low, high = searched_s
+    near = max(LATENCY_AT_END * (high - low), 0.5 * problem.episodes[0].step_s)
+    if latency_s > high - near:
+        return 1
+    return -1 if low > 0 and latency_s < low + near else 0
+
+
+def wider_latency(latency_range_s: tuple[float, float], end: int) -> tuple[float, float]:
+    """Return a range of the latency that goes on at one end: -1, down to zero, or 1, twice as far [s]."""
+    low, high = latency_range_s
+    return (low, min(2 * high, LONGEST_LATENCY_S)) if end > 0 else (0.0, high)
 
 
 def _covariance(precision: FloatArray, free: npt.NDArray[np.bool_]) -> FloatArray:

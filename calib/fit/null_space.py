@@ -14,11 +14,9 @@ import numpy as np
 from scipy.optimize import linprog
 
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calibration import LATENCY
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-
-LATENCY = "latency"
-
 
 LEAST_INFORMATION = 1.0
 """Information below this, relative to that of the range itself, counts as none [-]."""

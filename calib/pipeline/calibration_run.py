@@ -44,6 +44,7 @@ class FitOutcome:
         facts: More entries for the provenance: plain JSON values.
         space: Parameters of the estimate, where fits may have more of them than the search, whose population
             is then left out; None: the search's.
+        latency_range_s: Range of the latency's fit [s]; None: the problem's.
     """
 
     searched: CalibrationResult
@@ -53,6 +54,7 @@ class FitOutcome:
     known: Uncertainty
     facts: Mapping[str, Any] = field(default_factory=dict)
     space: ParameterSpace | None = None
+    latency_range_s: tuple[float, float] | None = None
 
     def with_alarms(
         self, *first: Finding, last: Sequence[Finding] = (), chi2: float | None = None, **facts: Any

@@ -160,7 +160,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         local = local_fit(problem, offer) if self.settings.local_first else None
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
-        given = problem.space
+        given = problem
         if local is not None:
             run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
         problem = run.problem
@@ -209,7 +209,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         }
         if run.problem.robot.step_s < problem.robot.step_s:
             provenance["fit_step_s"] = run.problem.robot.step_s
-        if grown := grown_ranges(given, found.space or searched.space):
+        latency_range_s = found.latency_range_s or given.latency_range_s
+        if grown := grown_ranges(given, found.space or searched.space, latency_range_s):
             provenance["grown_ranges"] = grown
         if run.left_out:
             provenance["checks_left_out"] = dict(run.left_out)
@@ -435,6 +436,7 @@ def conclude_fit(
         known=known,
         facts=facts,
         space=problem.space,
+        latency_range_s=problem.latency_range_s,
     )
 
 

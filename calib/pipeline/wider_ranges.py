@@ -1,25 +1,27 @@
 """Ranges that nobody chose grow where the recordings ask for it.
 
 The usual range of a parameter is a factor around the model's value. It is a guess, and a model may be further
-off: on a real cart-pole the model's motor was too weak by a factor of 12.
+off: on a real cart-pole the model's motor was too weak by a factor of 12. So is that of the latency: a filter
+of a drive adds to a delay, and both can be later than any delay alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import pressed_ends
+from deal_hw.calib.fit.intervals import latency_end, pressed_ends, wider_latency
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.minima import clearly_lower
-from deal_hw.calibration import BEFORE_SEARCH, listed
+from deal_hw.calibration import BEFORE_SEARCH, LATENCY, listed
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import wider
 
 MOST = 2
-"""Most times that a range grows: a factor of 125 for most kinds. Beyond it the model is wrong."""
+"""Most times that a range grows: a factor of 125 for most kinds, 4 for the latency. Beyond it the model is
+wrong."""
 
 Again = Callable[[Problem, Refined], Refined | None]
 """Returns the fit with wider ranges, from that with narrower ones; None where none is better."""
@@ -28,15 +30,29 @@ Again = Callable[[Problem, Refined], Refined | None]
 def pressed(problem: Problem, fit: Refined) -> dict[str, int]:
     """Return the guessed ranges that the data press, by parameter: -1 at the lower end, 1 at the higher."""
     # Where a narrow range leaves a large residual, it hides what else the recordings show: that is no reason.
-    ends = pressed_ends(problem.space, fit.theta, fit.normal.gradient[: len(problem.space)])
+    K, slope = len(problem.space), fit.normal.gradient
+    ends = pressed_ends(problem.space, fit.theta, slope[:K])
     sides = dict(zip(problem.space.names, map(int, ends), strict=True))
+    if (end := latency_end(problem, fit.latency_s, problem.latency_range_s)) and end * slope[K] <= 0:
+        sides[LATENCY] = end
     return {name: side for name, side in sides.items() if side and name in problem.guessed}
 
 
-def grown_ranges(before: ParameterSpace, after: ParameterSpace) -> dict[str, list[float]]:
-    """Return the ranges that have grown, by parameter: plain JSON values."""
+def grown_ranges(
+    before: Problem, after: ParameterSpace, latency_range_s: tuple[float, float]
+) -> dict[str, list[float]]:
+    """Return the ranges that have grown, by parameter, and that of the latency [s]: plain JSON values."""
     ends = {p.name: [p.low, p.high] for p in after}
-    return {p.name: ends[p.name] for p in before if ends[p.name] != [p.low, p.high]}
+    grown = {p.name: ends[p.name] for p in before.space if ends[p.name] != [p.low, p.high]}
+    return grown if latency_range_s == before.latency_range_s else grown | {LATENCY: list(latency_range_s)}
+
+
+def _wider(problem: Problem, sides: Mapping[str, int]) -> Problem:
+    """Return the problem with ranges that go on at these ends, by parameter."""
+    found = problem.with_space(wider(problem.space, {n: side for n, side in sides.items() if n != LATENCY}))
+    if LATENCY in sides:
+        found.latency_range_s = wider_latency(problem.latency_range_s, sides[LATENCY])
+    return found
 
 
 def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[CalibrationRun, Refined]:
@@ -47,12 +63,13 @@ def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[
         fit: A fit to its recordings.
         again: Fits with wider ranges.
     """
-    given = run.problem.space
+    given = run.problem
     for _ in range(MOST):
-        space = wider(run.problem.space, pressed(run.problem, fit))
-        if not grown_ranges(run.problem.space, space):
+        if not (sides := pressed(run.problem, fit)):
             break
-        problem = run.problem.with_space(space)
+        problem = _wider(run.problem, sides)
+        if not grown_ranges(run.problem, problem.space, problem.latency_range_s):
+            break
         found = again(problem, fit)
         if found is None:
             break
@@ -61,16 +78,16 @@ def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[
         if not (longer or clearly_lower(found, fit)):
             break
         run, fit = dataclasses.replace(run, problem=problem), found
-    if grown := grown_ranges(given, run.problem.space):
-        ranges = listed(
-            [
-                f"{name} {low:.3g} to {high:.3g} {given[name].unit}".rstrip()
-                for name, (low, high) in grown.items()
-            ]
-        )
+    if grown := grown_ranges(given, run.problem.space, run.problem.latency_range_s):
+        units = {p.name: p.unit for p in given.space} | {LATENCY: "s"}
+        ranges = [
+            f"{name} {low:.3g} to {high:.3g} {units[name]}".rstrip() for name, (low, high) in grown.items()
+        ]
+        options = ["--latency-range LOW HIGH"] if LATENCY in grown else []
+        options += ["--range NAME LOW HIGH"] if len(grown) > len(options) else []
         run.say(
             BEFORE_SEARCH,
             "the recordings press against the ends of usual ranges, and beyond them the fit is better. New "
-            f"ranges: {ranges}. If such values are impossible, give a range (--range NAME LOW HIGH)",
+            f"ranges: {listed(ranges)}. If such values are impossible, give a range ({', '.join(options)})",
         )
     return run, fit

@@ -23,8 +23,10 @@ from deal_hw.calib.fit.intervals import (
     NEGLIGIBLE_CHI2,
     Uncertainty,
     correlation_time,
+    latency_end,
     names_at_bound,
     uncertainty_at,
+    wider_latency,
     with_rows,
 )
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
@@ -37,13 +39,10 @@ from deal_hw.calib.validation.explain import Allows, Tried
 from deal_hw.calib.validation.residual_place import residual_place
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
-from deal_hw.calibration import Z90, listed
+from deal_hw.calibration import LATENCY, Z90, listed
 from deal_hw.findings import Finding
-from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
+from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-
-AT_END = 0.01
-"""Distance to an end of the latency range, as a share of it, that counts as at the end [-]."""
 
 MOST_CAUSES = 2
 """Most causes of a residual that become alarms; all are in the provenance."""
@@ -62,22 +61,22 @@ intervals of some halves always miss each other."""
 HALVES = "two halves of the data"
 """Name of the split-half check."""
 
-LATENCY = "latency"
-"""Name of the latency among the values that a cause moves."""
 
+def latency_alarms(
+    problem: Problem, latency_s: float, searched_s: tuple[float, float] | None = None
+) -> tuple[Finding, ...]:
+    """Return an alarm where a searched latency ended at an end of its range; zero is no such end.
 
-def latency_alarms(problem: Problem, latency_s: float) -> tuple[Finding, ...]:
-    """Return an alarm where a searched latency ended at an end of its range; zero is no such end."""
-    if problem.fixed_latency_s is not None:
+    Args:
+        problem: The problem.
+        latency_s: The latency [s].
+        searched_s: Its range at last [s]; None: the problem's.
+    """
+    low, high = searched_s or problem.latency_range_s
+    end = latency_end(problem, latency_s, (low, high))
+    if not end:
         return ()
-    low, high = problem.latency_range_s
-    near = max(AT_END * (high - low), 0.5 * problem.episodes[0].step_s)
-    if latency_s > high - near:
-        side, wider = "later", (low, min(2 * high, LONGEST_LATENCY_S))
-    elif low > 0 and latency_s < low + near:
-        side, wider = "sooner", (0.0, high)
-    else:
-        return ()
+    side, wider = "later" if end > 0 else "sooner", wider_latency((low, high), end)
     return (
         Finding.alarm(
             f"The latency ended at {1e3 * latency_s:.3g} ms, the end of what was searched ({1e3 * low:g} to "

@@ -117,6 +117,41 @@ def test_calibrate_finds_a_value_far_outside_the_usual_range(files: dict[str, Pa
     assert not any("Ended at the bound" in alarm.seen for alarm in found.result.alarms)
 
 
+def late(files: dict[str, Path], folder: Path, delay_s: float) -> dict[str, Path]:
+    """Return files of the same arm whose commands act later than they are noted."""
+    with np.load(files["data"]) as noted:
+        columns = dict(noted)
+    # The commands were sent earlier than they acted, so the recording begins as much later.
+    shift = round(delay_s / PERIOD_S)
+    time = columns["time"][: len(columns["time"]) - shift]
+    sent, position = columns["shoulder.command"][shift:], columns["shoulder"][: len(time)]
+    np.savez(folder / "late.npz", **{"time": time, "shoulder": position, "shoulder.command": sent})
+    return files | {"data": folder / "late.npz"}
+
+
+def test_calibrate_finds_a_latency_beyond_the_usual_range(files: dict[str, Path], tmp_path: Path) -> None:
+    """Truth recovery: a delay of 60 ms within 2 ms, and the new range is noted and said."""
+    said: list[str] = []
+    own = late(files, tmp_path, 0.06)
+    found = deal_hw.calibrate(
+        model=own["model"], data=own["data"], columns=own["columns"], threads=1, say=said.append
+    )
+    assert found.result.latency_s == pytest.approx(0.06, abs=0.002)
+    assert found.result.provenance["grown_ranges"]["latency"] == [0.0, 0.08]
+    assert any("latency 0 to 0.08 s" in text and "--latency-range LOW HIGH" in text for text in said)
+    assert [str(a) for a in found.result.alarms if "The latency ended" in a.seen] == []
+
+
+@pytest.mark.parametrize("given", [{"latency_range": (0.0, 0.05)}, {"latency": 0.01}])
+def test_a_latency_that_somebody_gave_stays(
+    files: dict[str, Path], tmp_path: Path, given: dict[str, object]
+) -> None:
+    """A given range or value of the latency is no guess, and an alarm asks for a wider range."""
+    own = late(files, tmp_path, 0.06)
+    settings = FilesSettings(model=own["model"], data=(own["data"],), columns=own["columns"], **given)  # type: ignore[arg-type]
+    assert "latency" not in calibration_input(settings).guessed
+
+
 @pytest.mark.parametrize("given", [{"range": (("shoulder.damping", 0.004, 0.101),)}, {"range_ratio": 5.0}])
 def test_a_range_that_somebody_gave_stays(files: dict[str, Path], given: dict[str, object]) -> None:
     """A user's limits are facts about the robot; the fit ends at them."""
@@ -166,6 +201,7 @@ def test_a_state_of_a_search_knows_which_ranges_may_grow(files: dict[str, Path])
         "shoulder.damping",
         "shoulder.armature",
         "shoulder.gain",
+        "latency",
     )
     chosen = dataclasses.replace(problem, guessed=())
     first, again, other = (

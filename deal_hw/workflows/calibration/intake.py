@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw.calib.pipeline.methods import UNALIGNED_METHODS
+from deal_hw.calibration import LATENCY, LATENCY_RANGE_S
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, MissingExtraError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
@@ -73,7 +74,7 @@ class CalibrationInput:
         policy: The policy that moved the robot all the time, if the method needs it.
         known_std: Expected standard deviation of the prediction error, positions then velocities, (2 C,);
             None: the sensor noise, estimated from the recordings.
-        guessed: Names of the parameters whose range nobody chose.
+        guessed: Names of the parameters whose range nobody chose; "latency" is the latency.
     """
 
     robot: RobotModel
@@ -172,6 +173,9 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
 
     # The ranges of our own robots are chosen, and a ratio is for all parameters.
     usual = isinstance(settings, UserRobotSettings) and settings.range_ratio is None
+    # A policy has its own distribution of the latency.
+    chosen = source.policy is not None or settings.latency is not None
+    guessed_latency = () if chosen or settings.latency_range != LATENCY_RANGE_S else (LATENCY,)
     return CalibrationInput(
         robot=robot,
         space=space,
@@ -186,7 +190,7 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         walks=walks,
         policy=source.policy,
         known_std=known_std,
-        guessed=with_usual_range(space) if usual else (),
+        guessed=(*(with_usual_range(space) if usual else ()), *guessed_latency),
     )
 
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from deal_hw.calibration import (
     BEFORE_SEARCH,
+    LATENCY,
     LATENCY_RANGE_S,
     Budget,
     CalibrationResult,
@@ -397,8 +398,9 @@ def calibrate_episodes(
             raise
     from deal_hw.calib.validation.checks import latency_alarms
 
-    alarms = (*result.alarms, *latency_alarms(problem, result.latency_s))
     provenance = result.provenance
+    first, last = provenance.get("grown_ranges", {}).get(LATENCY, problem.latency_range_s)
+    alarms = (*result.alarms, *latency_alarms(problem, result.latency_s, (first, last)))
     if in_loop:
         provenance = {
             **provenance,

@@ -88,7 +88,8 @@ class CalibrateSettings(Checked):
     """Total latency [s] if it is known; by default it is searched."""
 
     latency_range: Annotated[tuple[float, float], Range(0, LONGEST_LATENCY_S, "s")] = LATENCY_RANGE_S
-    """Range of the latency search, LOW HIGH [s]. Widen it if an alarm reports an estimate at its end."""
+    """Range of the latency search, LOW HIGH [s]. The default goes on, up to 0.16 s, where the recordings ask
+    for it."""
 
     spike_ratio: Annotated[float, Range(1, 1e6)] = DEFAULT_SPIKES.ratio
     """Leave out up to three successive samples that jump away and come back, if they jump more than this many
