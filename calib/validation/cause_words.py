@@ -114,9 +114,9 @@ LOOKS: Mapping[Cause, tuple[str, str, str]] = {
     ),
     "zero": (
         "an encoder whose zero is another one in each recording",
-        "The zeros were not the same in all recordings, as after a start where friction held the robot off "
-        "its rest.",
-        "Set the zero of {} in the same pose before each recording. Or give each recording a set-up with "
+        "The zeros were not the model's or not the same in all recordings, as after a start where friction "
+        "held the robot off its rest.",
+        "Set the zero of {} in the model's pose before each recording. Or give each recording a set-up with "
         "`encoder_bias` of its own, which is searched (--setups).",
     ),
     "mass": (

@@ -213,12 +213,14 @@ class Evidence:
         """Return the held-out deviance that ``more`` signatures gain in addition to ``taken``."""
         return self.count * float(np.log(self.held_out(taken) / self.held_out([*taken, *more])))
 
-    def places(self, taken: Sequence[Signature], group: Sequence[Signature]) -> list[str]:
+    def places(
+        self, taken: Sequence[Signature], group: Sequence[Signature], least: float = EVIDENCE
+    ) -> list[str]:
         """Return the joints or bodies whose signatures gain beside ``taken`` and the others of a group."""
         found = []
         for place in dict.fromkeys(s.where for s in group):
             rest = [s for s in group if s.where != place]
-            if self.gain([*taken, *rest], [s for s in group if s.where == place]) > EVIDENCE:
+            if self.gain([*taken, *rest], [s for s in group if s.where == place]) > least:
                 found.append(place)
         return found
 

@@ -43,6 +43,11 @@ def own_zeros(joints: Mapping[str, str], recordings: Sequence[str]) -> list[Para
     ]
 
 
+def common_zeros(joints: Mapping[str, str]) -> list[Parameter]:
+    """Return the zero of each joint in all recordings; ``joints`` are their units, by name."""
+    return [Parameter.encoder_bias(joint, MOST_ZERO, unit=unit) for joint, unit in joints.items()]
+
+
 def named_zeros(joint: str, unit: str, values: Mapping[str, float]) -> str:
     """Return a joint's zero in each recording in words."""
     each = [f"{value:+.2g} {unit} in {name}" for name, value in values.items()]
@@ -65,7 +70,7 @@ def next_zeros(space: ParameterSpace, theta: FloatArray) -> tuple[list[Parameter
     There are none where the fitted recordings have no zeros of their own.
     """
     found, units = zeros_of(space, theta), _joints(space)
-    more = [Parameter.encoder_bias(joint, MOST_ZERO, unit=units[joint]) for joint in found]
+    more = common_zeros({joint: units[joint] for joint in found})
     values = [np.array(list(each.values())) for each in found.values()]
     # That of a further draw from a Gaussian whose mean comes from n draws, too.
     std = [np.std(each, ddof=1) * np.sqrt(1 + 1 / len(each)) for each in values]

@@ -113,11 +113,33 @@ def test_without_laws_zeros_that_differ_are_named_only(recorded: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_zero_of_all_recordings_is_not_one_of_each(recorded: Path, tmp_path: Path) -> None:
-    """Both have the first one's offsets."""
+def test_one_zero_of_all_recordings_is_one_value(recorded: Path, tmp_path: Path) -> None:
+    """Both have the first one's offsets, which are found within 1 mrad; only noise is left."""
     files = [_recording(tmp_path / f"{name}.csv", seed, BIASES["first"]) for seed, name in enumerate("ab")]
     found = deal_hw.calibrate(
         recorded / "arm.xml", files, parameters=recorded / "p.yaml", latency=0.0, threads=1
     ).result
+    values = dict(zip(found.space.names, found.estimate, strict=True))
+    zeros = {name: value for name, value in values.items() if "encoder_bias" in name}
+    assert zeros == {
+        f"{joint}.encoder_bias": pytest.approx(bias, abs=0.001) for joint, bias in BIASES["first"].items()
+    }
+    assert found.chi2 < 1.2 and values["elbow.damping"] == pytest.approx(0.1, rel=0.02)
+    assert "With another zero of its encoders (pitch +0.03 rad, elbow -0.05 rad)" in found.alarms[0].seen
+    assert found.provenance["candidates"][0]["explanation"] == "another zero of the encoders"
+
+
+@pytest.mark.slow
+def test_an_unmodelled_mass_is_no_zero(recorded: Path, tmp_path: Path) -> None:
+    """The forearm is heavier than its model: no zero is taken for it."""
+    text = (recorded / "arm.xml").read_text(encoding="utf-8")
+    model = mujoco.MjModel.from_xml_string(text)
+    model.body_mass[-1] *= 1.5
+    model.body_inertia[-1] *= 1.5
+    for seed, name in enumerate("ab"):
+        record(model, tmp_path / f"{name}.csv", seed)
+    files = [tmp_path / f"{name}.csv" for name in "ab"]
+    found = deal_hw.calibrate(
+        recorded / "arm.xml", files, parameters=recorded / "p.yaml", latency=0.0, threads=1
+    ).result
     assert not any("encoder_bias" in name for name in found.space.names)
-    assert "zero of its own" not in str(found.alarms)
