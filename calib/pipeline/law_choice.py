@@ -2,14 +2,17 @@
 
 No simulator explains a real robot down to its sensors' noise, so a law is not asked to. Each is fitted to a
 part of the recordings and predicts the rest. Around a fit without it, its linearised effect says little: on a
-real XL330 dry friction has taken the place of friction by load, and only a fit finds the way back. Fits with
-the best laws are candidates of the cross-validation over the motions. One is taken where it predicts every
+real XL330 dry friction has taken the place of friction by load, and only a fit finds the way back. Sometimes
+none does: where an arm's motors are slow, inertia and damping take the place of their free speed, so far from
+the truth that a fit from there ends elsewhere. So fits begin at the model's own values, too. Fits with the
+best laws are candidates of the cross-validation over the motions. One is taken where it predicts every
 fold better than all fits without it do. Then the others are asked for again, on top of it: friction by load
 hides what friction does at rest, and a robot can have both.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +22,7 @@ import numpy as np
 
 from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.problem import Member, Problem, samples_in
-from deal_hw.calib.fit.intervals import EVIDENCE
+from deal_hw.calib.fit.intervals import EVIDENCE, latency_end
 from deal_hw.calib.fit.output_error import (
     Recipe,
     fit_output_error,
@@ -27,14 +30,15 @@ from deal_hw.calib.fit.output_error import (
     prediction_rmse,
 )
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
-from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun
-from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome
-from deal_hw.calib.validation.checks import latency_alarms
+from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
+from deal_hw.calib.pipeline.minima import conclusive, refined_from
+from deal_hw.calib.pipeline.stages import conclude_fit
+from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome, ranked
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks
 from deal_hw.calib.validation.explain import RIVAL, applicable
 from deal_hw.calib.validation.explanations import LAG, Explanation
 from deal_hw.calib.validation.wider_models import NOTICED
-from deal_hw.calibration import listed, percent
+from deal_hw.calibration import LATENCY, CalibrationResult, listed, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
@@ -49,7 +53,8 @@ MOST_TAKEN = 3
 
 SCREEN_ITERATIONS, FOLD_ITERATIONS, ITERATIONS = 2, 3, 6
 """Most derivatives of each fit with a law, to a part of the recordings, in a fold and to all of them. The
-first begins where the fit without the law ended, the others where the first did."""
+first begins where the fit without the law ended or at the model's own values, the others where the first
+did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,12 +282,41 @@ def take_laws(
         found = dataclasses.replace(found, problem=wide, member=members[choice.chosen])
         if len(found.rounds) == MOST_TAKEN:
             break
-        screened = screened_laws(run, wide, members[law.names[0]], seconds)
+        screened = screened_laws(run, wide, [members[law.names[0]]], seconds)
         if not screened.chosen:
             break
         again = screened, judged(wide, screened.chosen, choice)
         found = dataclasses.replace(found, rounds=[*found.rounds, again])
     return found
+
+
+def explained_by_laws(
+    run: CalibrationRun, searched: CalibrationResult, laws: LawsTaken, start: Member
+) -> FitOutcome | None:
+    """Return the result of a fit of start states, too, where laws were taken and leave only noise then.
+
+    Fits of predictions begin at smoothed states, whose errors bias them. A robot that its laws explain is
+    fitted as one that needs none.
+
+    Args:
+        run: The calibration, with the parameters of the laws.
+        searched: Result of the search, or its substitute.
+        laws: The laws.
+        start: Where the fit begins: values, (K,), and latency [s].
+    """
+    if not laws.choices:
+        return None
+    fit = refined_from(run, *start)
+    if not conclusive(run.problem, fit):
+        return None
+    found = conclude_fit(run, searched, fit)
+    rows = [row.to_json() for row in ranked(laws.candidates())]
+    return found.with_alarms(
+        *laws.findings(found.theta),
+        laws=laws.facts(found.theta),
+        cross_validation=laws.to_json(),
+        candidates=[*rows, *found.facts.get("candidates", [])],
+    )
 
 
 def law_errors(
@@ -329,21 +363,21 @@ def law_errors(
 
 
 def screened_laws(
-    run: CalibrationRun, problem: Problem, fit: Member, seconds: tuple[float, float]
+    run: CalibrationRun, problem: Problem, fits: Sequence[Member], seconds: tuple[float, float]
 ) -> ScreenedLaws:
     """Fit each law to half of the recordings, and return those that predict the other better, beyond chance.
 
     Args:
         run: The calibration.
         problem: The recordings, as they are fitted.
-        fit: Their fit without a further law: values, (K,), and latency [s]. That of the half begins there,
-            too, and has as many derivatives.
+        fits: Where fits with a law begin, (K,) and latency [s] each: that of all recordings without a further
+            law, then others. The fit of the half without one begins at the first, with as many derivatives.
         seconds: Windows of the candidates [s]: the first are those of these fits and their predictions.
     """
-    can = applicable(problem)
-    theta, latency_s = fit
-    if latency_alarms(problem, latency_s):
-        # A latency beyond its range is the simpler explanation, and an alarm asks for it.
+    can, fit = applicable(problem), fits[0]
+    if LATENCY not in problem.guessed and latency_end(problem, fit[1], problem.latency_range_s):
+        # A latency beyond a range that somebody gave is the simpler explanation, and an alarm asks for it. A
+        # guessed range has grown as far as that gains.
         can.pop(LAG, None)
     if not can:
         return ScreenedLaws()
@@ -358,11 +392,8 @@ def screened_laws(
             return ScreenedLaws()
         for law, more in can.items():
             run.say(EXPLANATIONS, f"does {law.name} predict motion that it was not fitted to?")
-            wide = part.with_more(more)
-            start = np.append(theta, [p.nominal for p in more]), latency_s
-            try:
-                member = fit_output_error(wide, *start, recipe).member
-            except CalibrationError:
+            member = _with_law(part.with_more(more), more, fits, recipe)
+            if member is None:
                 continue
             rmse = prediction_rmse(rest.with_more(more), [member], seconds[0])[0]
             if not np.isfinite(rmse).all():
@@ -372,6 +403,28 @@ def screened_laws(
     found = ScreenedLaws((), shares, count)
     chosen = found.promising()
     return dataclasses.replace(found, chosen=[law for law in laws if law.explanation.name in chosen])
+
+
+def _with_law(
+    problem: Problem, more: Sequence[Parameter], starts: Sequence[Member], recipe: Recipe
+) -> Member | None:
+    """Return the fit with a law's parameters that predicts best what it was fitted to; None if all diverge.
+
+    Args:
+        problem: The recordings, with the parameters.
+        more: The parameters, which begin at their nominal values.
+        starts: Where the fits begin, without the parameters.
+        recipe: The fits.
+    """
+    members = list[Member]()
+    for theta, latency_s in starts:
+        start = np.append(theta, [p.nominal for p in more])
+        with contextlib.suppress(CalibrationError):
+            members.append(fit_output_error(problem, start, latency_s, recipe).member)
+    if len(members) < 2:
+        return members[0] if members else None
+    errors = np.mean(np.log(prediction_rmse(problem, members, recipe.seconds)), axis=1)
+    return members[int(np.argmin(np.nan_to_num(errors, nan=np.inf)))]
 
 
 def _unexplained(problem: Problem, member: Member, seconds: float) -> tuple[FloatArray, float]:

@@ -9,8 +9,8 @@ The right residual scale, the right window length, and whether to stop early dif
 3. Cross-validation over the motions compares candidates by their prediction of unseen data. Candidates are
    the fits over short and long windows, that over the longest ones with a robust loss or without a latency,
    the search's estimate if it was the better start, and fits with a law that the model lacks.
-4. The best candidate is fitted to all data. Two halves of the data are compared, and confounded parameters
-   are listed.
+4. The best candidate is fitted to all data. If its laws leave only noise, the result is the exact fit, of
+   start states, too. Otherwise two halves of the data are compared, and confounded parameters are listed.
 
 Held-out recordings take no part in any of this.
 """
@@ -181,12 +181,18 @@ class OutputErrorFits(Fits):
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
-        from deal_hw.calib.pipeline.law_choice import LawfulChoice, ScreenedLaws, screened_laws, take_laws
+        from deal_hw.calib.pipeline.law_choice import (
+            LawfulChoice,
+            ScreenedLaws,
+            explained_by_laws,
+            screened_laws,
+            take_laws,
+        )
         from deal_hw.calib.validation import checks
         from deal_hw.calib.validation.candidates import ranked
         from deal_hw.calib.validation.cross_validation import Choice
         from deal_hw.calib.validation.diagnosis import diagnose
-        from deal_hw.calib.validation.explain import refused
+        from deal_hw.calib.validation.explain import FAR, refused
         from deal_hw.calib.validation.explanations import EXPLANATIONS
 
         settings, (first, *windows) = self.settings, self.first or self.started(run).first
@@ -205,7 +211,8 @@ class OutputErrorFits(Fits):
         screened, lengths = ScreenedLaws(), (windows[0].recipe.seconds, settings.long_s)
         if run.settings.cross_validation:
             if self.tries_laws(run):
-                screened = screened_laws(run, problem, windows[0].member, lengths)
+                own = problem.space.nominal, problem.first_latency_s
+                screened = screened_laws(run, problem, [windows[0].member, own], lengths)
             decided = self._choose(run, problem, seed, (first, *windows), screened.chosen, search=better)
         laws = take_laws(run, problem, (screened, decided), partial(self._with_laws, run), lengths)
         choice = laws.made
@@ -227,6 +234,8 @@ class OutputErrorFits(Fits):
             # With fitted start states the residual shows model error, not smoothing error.
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
             chi2 = left.normal.cost / max(left.normal.count, 1)
+            if chi2 <= FAR and (exact := explained_by_laws(run, searched, laws, (theta, latency_s))):
+                return exact
         local = None if run.local is None else with_rows(run.local)
         found: Diagnosed | None = None
         judged = run.problem, local
@@ -289,6 +298,7 @@ class OutputErrorFits(Fits):
             known=known,
             facts=facts,
             space=problem.space,
+            latency_range_s=problem.latency_range_s,
         )
 
     def _searched(

@@ -41,7 +41,7 @@ MOST_SERVO_DEAD_ZONE = 0.1
 """The same of a servo [rad or m]. AX-12A: 0.0051 rad as it is delivered; HerkuleX: below 10 counts of 0.0057
 rad are recommended."""
 
-FREE_SPEEDS = (10.0, 1.0, 100.0)
+FREE_SPEEDS = (3.0, 1.0, 100.0)
 """Free speed at which a fit begins, the least and the largest one, in rms speeds of the joint [-]. The
 largest one takes a hundredth of the effort at that speed."""
 

@@ -247,7 +247,7 @@ def test_friction_by_load_is_chosen_where_dry_friction_has_taken_its_place(tmp_p
     )
     problem = Problem(work.robot, work.space, work.episodes, threads=1, fixed_latency_s=0.0)
     fit = fit_output_error(problem, problem.space.nominal, 0.0, Recipe(seconds=0.4))
-    found = screened_laws(small_run(problem), problem, fit.member, (0.4, 2.0))
+    found = screened_laws(small_run(problem), problem, [fit.member], (0.4, 2.0))
     (law,) = found.chosen
     assert law.explanation.name == "friction that grows with load"
     shares = dict(found.shares)
