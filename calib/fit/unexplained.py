@@ -33,9 +33,9 @@ class Unexplained(Finding):
                 "The model does not explain the recording: it lacks something that the robot has, or a "
                 "sensor is wrong there: blind or bent in a part of its range, or with another scale. The "
                 "intervals count all of it as noise.",
-                "Plot the measured positions there, and check the sensor's scale against a known angle or "
-                "length. Leave out what a sensor got wrong, or repair it; else add to the model what is "
-                "missing. Judge this model by its held-out error.",
+                "See in the report where on the motion they are largest, and check the sensor's scale "
+                "against a known angle or length. Leave out what a sensor got wrong, or repair it; else add "
+                "to the model what is missing. Judge this model by its held-out error.",
             )
         else:
             found = Finding.alarm(

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from deal_hw.calib.data.noise import autocorrelations
-from deal_hw.calib.report.gather import OverlayPanel, Residuals
+from deal_hw.calib.report.gather import OverlayPanel, Residuals, Spread
 from deal_hw.calib.report.panels import Panel, Series, envelope, nice_step
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
@@ -108,6 +108,33 @@ def residuals(shown: Residuals) -> tuple[Markup, str]:
     words = "" if M <= MOST_CHANNELS else f"the {MOST_CHANNELS} channels with the largest residuals of {M}"
     rows = [group(_residual_row(shown, int(m), float(size[m])), "residual") for m in sorted(order)]
     return Markup("").join(rows), words
+
+
+def spread(shown: Sequence[Spread]) -> Markup:
+    """Draw the size of residuals over the motion of their joints, one row for each channel."""
+    largest: dict[str, float] = {}
+    for one in shown:
+        largest[one.channel] = max(largest.get(one.channel, 0.0), float(np.nanmax(one.size)))
+    kept = sorted(largest, key=lambda name: -largest[name])[:MOST_CHANNELS]
+    rows = []
+    for channel in (name for name in largest if name in kept):
+        panels = []
+        for one in (one for one in shown if one.channel == channel):
+            step = one.at[1] - one.at[0]
+            unit = f" [{one.unit}]" if one.unit else ""
+            panels.append(
+                Panel(
+                    title=f"{channel}, by {one.kind}",
+                    x_title=f"{one.kind}{unit}",
+                    series=[Series(name="residual", style="calibrated", kind="dots", x=one.at, y=one.size)],
+                    x=(float(one.at[0] - step / 2), float(one.at[-1] + step / 2)),
+                    y=(0.0, 1.08 * max(largest[channel], 2.0)),
+                    bands=[(0.0, 1.0)],
+                    label=f"{channel}: size of the residual [times the noise] over its {one.kind}{unit}",
+                )
+            )
+        rows.append(group(panels, "motion"))
+    return Markup("").join(rows)
 
 
 def _root_mean_square(values: FloatArray) -> float:

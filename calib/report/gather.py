@@ -12,13 +12,14 @@ import numpy as np
 from deal_hw.calib.data.innovations import Members, whitened_residual
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData, longest_windows, samples_in
 from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros
+from deal_hw.calib.validation.residual_place import quantities, size_over
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.own_setups import OWN
 from deal_hw.sim.recordings.parts import joined
-from deal_hw.types import FloatArray
+from deal_hw.types import FloatArray, IntArray
 from deal_hw.viz.robot_drawing import RobotDrawing, draw_robot
 
 MOST_PANELS = 24
@@ -76,6 +77,25 @@ class Residuals:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """Size of a channel's whitened residual in all fitted recordings, over a quantity of its joint.
+
+    Attributes:
+        channel: The channel.
+        kind: The quantity, such as "speed".
+        unit: Its unit.
+        at: Middles of the parts of its range, (B,).
+        size: Root mean square in each, (B,); NaN where there are too few samples.
+    """
+
+    channel: str
+    kind: str
+    unit: str
+    at: FloatArray
+    size: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReportInputs:
     """Everything on the page.
 
@@ -84,6 +104,7 @@ class ReportInputs:
         result: The calibration's result.
         overlays: Recordings beside predictions, held-out ones first.
         residuals: Whitened errors of the fitted recordings.
+        spread: The same over the motion of each joint.
         drawing: The robot at a moment of a held-out recording.
         heldout: Names of the held-out recordings.
         heldout_s: Their total length [s].
@@ -96,6 +117,7 @@ class ReportInputs:
     result: CalibrationResult
     overlays: tuple[OverlayPanel, ...] = ()
     residuals: tuple[Residuals, ...] = ()
+    spread: tuple[Spread, ...] = ()
     drawing: RobotDrawing | None = None
     heldout: tuple[str, ...] = ()
     heldout_s: float = 0.0
@@ -121,6 +143,7 @@ def gather(
     """
     overlays: list[OverlayPanel] = []
     residuals: list[Residuals] = []
+    spread: list[Spread] = []
     left_out: list[str] = []
     drawing = None
     # A recording that was cut into stretches is shown as one.
@@ -147,12 +170,13 @@ def gather(
             if heldout and drawing is None:
                 drawing = _worst_moment(problem, data, predicted, titles[data.episode])
         if not heldout:
-            residuals.extend(_residuals(problem, result, titles))
+            residuals, spread = _residuals(problem, result, titles)
     return ReportInputs(
         robot=robot.description.name,
         result=result,
         overlays=tuple(overlays),
         residuals=tuple(residuals),
+        spread=tuple(spread),
         drawing=drawing,
         heldout=tuple(dict.fromkeys(e.name for e in holdout)),
         heldout_s=float(sum(e.time_s[-1] - e.time_s[0] for e in holdout)),
@@ -227,7 +251,9 @@ def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
             yield from longest_windows(problem.part(alone), window_s)
 
 
-def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str]) -> list[Residuals]:
+def _residuals(
+    problem: Problem, result: CalibrationResult, titles: Sequence[str]
+) -> tuple[list[Residuals], list[Spread]]:
     centre = Members(result.estimate[None], np.array([result.latency_s]))
     M = len(problem.channels)
     length = max(min(samples_in(problem, WHITENED_S), WHITENED_SIZE // M), 2)
@@ -235,7 +261,7 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
     try:
         windows = problem.windows(length)
     except InsufficientDataError:
-        return []
+        return [], []
     for data in windows:
         whitened = whitened_residual(problem, centre, centre, [data]).reshape(data.measured.shape)
         # A missing sample has weight zero: its zero is no residual.
@@ -249,4 +275,22 @@ def _residuals(problem: Problem, result: CalibrationResult, titles: Sequence[str
                 whitened=whitened,
             )
         )
+    at = [(data.episode, data.windows.samples().ravel()) for data in windows]
+    power = np.concatenate([one.whitened.reshape(-1, M) ** 2 for one in found])
+    return found, _spread(problem, result.latency_s, power, at)
+
+
+def _spread(
+    problem: Problem, latency_s: float, power: FloatArray, at: Sequence[tuple[int, IntArray]]
+) -> list[Spread]:
+    """Return the size of the residual, (n, M), over the motion of the joints; ``at`` has its samples."""
+    found, of = list[Spread](), quantities(problem, latency_s)
+    for m, channel in enumerate(problem.channel_names):
+        for one in of:
+            if one.of != channel or one.kind == "time":
+                continue
+            values = np.concatenate([one.values[e][samples] for e, samples in at])
+            middle, size = size_over(power[:, m], values)
+            if np.isfinite(size).sum() > 1:
+                found.append(Spread(channel=channel, kind=one.kind, unit=one.unit, at=middle, size=size))
     return found

@@ -133,6 +133,7 @@ def render(inputs: ReportInputs) -> str:
         heldout_joints=joints,
         split=_mapping(_mapping(provenance.get("split_half")).get("parameters")),
         residuals=[(shown, *charts.residuals(shown)) for shown in inputs.residuals],
+        spread=charts.spread(inputs.spread) if inputs.spread else None,
         advice=advice_rows(result),
         scan=charts.latency_scan(_mapping(provenance.get("latency_scan")), inputs.tick_s),
         correlations=None if matrix is None else charts.correlations(matrix),

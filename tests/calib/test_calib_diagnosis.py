@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from fakes.knee_evidence import PERIOD_S, SAMPLES, STD, WINDOWS, knee_evidence, knee_motion, moved_by
 from fakes.plain_truth import problem_of, truth
@@ -25,7 +26,14 @@ from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, unsure_
 from deal_hw.calib.validation.evidence import Evidence, evidence
 from deal_hw.calib.validation.explain import explained, try_explanations
 from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
-from deal_hw.calib.validation.residual_place import densest_stretch
+from deal_hw.calib.validation.residual_place import (
+    Kind,
+    Quantity,
+    densest,
+    densest_stretch,
+    quantities,
+    size_over,
+)
 from deal_hw.calib.validation.signatures import (
     Cause,
     Signature,
@@ -300,6 +308,64 @@ def test_a_residual_without_a_cause_is_placed(small_problem: Callable[..., Probl
     assert "None of the known causes" in seen and "10.0 times" in seen
     assert "where cart is between" in seen and f"and {cart.max():.2f} m" in seen
     assert "100 % of its square is in cart" in seen
+
+
+def test_what_a_residual_may_depend_on(small_problem: Callable[..., Problem]) -> None:
+    """Position, speed and load of each joint, the command of those with a motor, and the time."""
+    problem = small_problem()
+    found = {(one.kind, one.of): one for one in quantities(problem, 0.0)}
+    assert set(found) == {
+        *((kind, joint) for kind in ("position", "speed", "load") for joint in ("cart", "pole")),
+        ("command", "cart"),
+        ("time", problem.episodes[0].name),
+    }
+    assert [found[kind, "pole"].unit for kind in ("position", "speed", "load")] == ["rad", "rad/s", "N·m"]
+    (command,), (episode,) = found["command", "cart"].values, problem.episodes
+    late = {one.kind: one for one in quantities(problem, 30 * episode.step_s)}["command"].values[0]
+    assert len(command) == len(episode.sample) and not np.array_equal(command, late)
+    assert command[-1] == episode.target[episode.sample[-1] - 1, 0]
+    assert late[-1] == episode.target[episode.sample[-1] - 31, 0]
+
+
+def test_a_residual_is_placed_by_what_it_depends_on() -> None:
+    """At large speeds either way, against one direction, or once; a position as dense as a time is named."""
+    rng = np.random.default_rng(0)
+    n = 20_000
+    position, speed = rng.uniform(-1.0, 1.0, n), rng.normal(0.0, 1.0, n)
+    time = np.linspace(0.0, 20.0, n)
+    named: list[tuple[Kind, str, str, FloatArray]] = [
+        ("time", "swing.csv", "s", time),
+        ("speed", "elbow", "rad/s", speed),
+        ("position", "elbow", "rad", position),
+    ]
+    over = [(Quantity(kind, of, unit, ()), values) for kind, of, unit, values in named]
+
+    def place(there: npt.NDArray[np.bool_]) -> str:
+        found = densest(np.where(there, 400.0, 1.0), over)
+        assert found is not None and found[0].density > 2.5
+        return found[1]
+
+    assert place(np.abs(speed) > 2.2).startswith("where the speed of elbow is between 2.")
+    assert place(np.abs(speed) > 2.2).endswith("rad/s, either way")
+    assert "either way" not in place(speed < -2.0)
+    assert place((time > 5.0) & (time < 5.5)).endswith("s of swing.csv")
+    once = [(over[0][0], time), (over[2][0], time / 10)]
+    found = densest(np.where(time > 19.5, 400.0, 1.0), once)
+    assert found is not None and found[1].startswith("where elbow is between")
+    assert densest(np.ones(n), over) is None
+
+
+def test_the_size_of_a_residual_over_a_quantity() -> None:
+    """By hand: 3 in the lower half of the range, 1 in the upper one; too few samples are no value."""
+    values = np.concatenate([np.linspace(0.0, 1.0, 320, endpoint=False), [2.0]])
+    middle, size = size_over(np.where(values < 0.5, 9.0, 1.0), values)
+    # Parts are 1/8 wide: 40 samples in each up to 1, none beyond, and one in the last.
+    assert middle[:2] == pytest.approx([0.0625, 0.1875])
+    assert size[:8] == pytest.approx([3.0] * 4 + [1.0] * 4)
+    assert np.isnan(size[8:]).all()
+    assert all(len(part) == 0 for part in size_over(np.ones(50), np.ones(50)))
+    missing = np.where(np.arange(len(values)) % 2, np.nan, 4.0)
+    assert size_over(missing, values)[1][0] == pytest.approx(2.0)
 
 
 def _with_gaps(known: Evidence, share: float) -> Evidence:

@@ -547,6 +547,22 @@ def test_gathered_residuals_of_the_truth_are_white(gathered: ReportInputs) -> No
         assert np.max(np.abs(autocorrelation(shown.whitened[..., m])[0])) < 0.25
 
 
+def test_the_residual_is_shown_over_the_motion_of_each_joint(gathered: ReportInputs) -> None:
+    """Of the truth it is about the noise at all positions, speeds, commands and loads."""
+    kinds = {
+        channel: [one.kind for one in gathered.spread if one.channel == channel]
+        for channel in ("cart", "pole")
+    }
+    # The pole has no motor.
+    assert kinds == {"cart": ["position", "speed", "command", "load"], "pole": ["position", "speed", "load"]}
+    for one in gathered.spread:
+        assert len(one.at) == len(one.size) and np.nanmax(one.size) < 2.0
+    load = next(one for one in gathered.spread if one.channel == "cart" and one.kind == "load")
+    assert load.unit == "N"
+    page = render(gathered)
+    assert "Where on the motion they lie" in page and "pole, by speed" in page and "speed [rad/s]" in page
+
+
 def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tmp_path: Path) -> None:
     """Everything is written and read back; without inputs there is no report."""
     robot = load_model(DESCRIPTION)
