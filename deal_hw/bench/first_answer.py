@@ -343,6 +343,7 @@ def _compared(
         rng=np.random.default_rng(seed),
         threads=threads,
         progress=watch,
+        guessed=work.guessed,
     )
     shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s, result.space))
 

@@ -120,6 +120,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
                 rng=np.random.default_rng(seed),
                 threads=threads,
                 progress=_ends_when_named if _shared(fault) else None,
+                guessed=work.guessed,
             )
         except _NamedError as end:
             messages.append(str(end))
