@@ -7,7 +7,7 @@ load. Something that happened once lies in one stretch of time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -119,7 +119,7 @@ def quantities(problem: Problem, latency_s: float) -> list[Quantity]:
             force = "N" if unit == "m" else "N·m"
             found.append(Quantity("load", name, force, tuple(load[:, j] for load in loads)))
     for e, episode in enumerate(problem.episodes):
-        times = [np.full(len(other.sample), np.nan) for other in problem.episodes]
+        times = [np.broadcast_to(np.nan, len(other.sample)) for other in problem.episodes]
         times[e] = episode.time_s
         found.append(Quantity("time", episode.name, "s", tuple(times)))
     return found
@@ -151,11 +151,15 @@ def residual_place(problem: Problem, refined: Refined) -> str:
     most = f"{percent(float(of_channel[worst]))} of its square is in {problem.channel_names[worst]}"
     # Samples that filled a gap have a residual of 0.
     seen = squared.any(axis=1)
-    over = [
-        (one, np.concatenate([one.values[e][samples] for e, samples in rows])[seen])
-        for one in quantities(problem, refined.latency_s)
-    ]
-    found = densest(squared.sum(axis=1)[seen], over)
+    total, every = squared.sum(axis=1)[seen], quantities(problem, refined.latency_s)
+
+    def over(*, time: bool) -> Iterator[tuple[Quantity, FloatArray]]:
+        for one in every:
+            if (one.kind == "time") == time:
+                yield one, np.concatenate([one.values[e][samples] for e, samples in rows])[seen]
+
+    # What happens once happens at some place, too, so a time is named only where no place is.
+    found = densest(total, over(time=False)) or densest(total, over(time=True))
     # Of a single channel it says nothing.
     channel = f"; {most}" if len(of_channel) > 1 else ""
     if found is None:
@@ -168,11 +172,11 @@ def residual_place(problem: Problem, refined: Refined) -> str:
     )
 
 
-def densest(power: FloatArray, over: Sequence[tuple[Quantity, FloatArray]]) -> tuple[Stretch, str] | None:
+def densest(power: FloatArray, over: Iterable[tuple[Quantity, FloatArray]]) -> tuple[Stretch, str] | None:
     """Return the densest stretch of all quantities, and where it is in words; None where none is dense.
 
     Joints move together, so a stretch of one quantity is one of others, too. Of those that are about as dense
-    the first of :data:`Kind` is named. A time is named alone: what happens once happens at some place, too.
+    the first of :data:`Kind` is named.
 
     Args:
         power: Squared residual of each sample, (n,).
@@ -187,7 +191,6 @@ def densest(power: FloatArray, over: Sequence[tuple[Quantity, FloatArray]]) -> t
             found.append((stretch, quantity, True))
     if not found:
         return None
-    found = [one for one in found if one[1].kind != "time"] or found
     most = max(stretch.density for stretch, _, _ in found)
     near = [one for one in found if one[0].density >= AS_DENSE * most]
     order = get_args(Kind)

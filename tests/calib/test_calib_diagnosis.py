@@ -328,7 +328,7 @@ def test_what_a_residual_may_depend_on(small_problem: Callable[..., Problem]) ->
 
 
 def test_a_residual_is_placed_by_what_it_depends_on() -> None:
-    """At large speeds either way, against one direction, or once; a position as dense as a time is named."""
+    """At large speeds either way, in one direction, or once; of two that are alike the position."""
     rng = np.random.default_rng(0)
     n = 20_000
     position, speed = rng.uniform(-1.0, 1.0, n), rng.normal(0.0, 1.0, n)
@@ -349,8 +349,8 @@ def test_a_residual_is_placed_by_what_it_depends_on() -> None:
     assert place(np.abs(speed) > 2.2).endswith("rad/s, either way")
     assert "either way" not in place(speed < -2.0)
     assert place((time > 5.0) & (time < 5.5)).endswith("s of swing.csv")
-    once = [(over[0][0], time), (over[2][0], time / 10)]
-    found = densest(np.where(time > 19.5, 400.0, 1.0), once)
+    alike = [(over[1][0], position), (over[2][0], position)]
+    found = densest(np.where(position > 0.95, 400.0, 1.0), alike)
     assert found is not None and found[1].startswith("where elbow is between")
     assert densest(np.ones(n), over) is None
 
