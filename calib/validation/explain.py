@@ -22,6 +22,7 @@ from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
 from deal_hw.calib.validation.explanations import (
     EXPLANATIONS,
+    LAG,
     PLAY,
     SHAPES,
     Explanation,
@@ -133,8 +134,9 @@ def try_explanations(
 ) -> tuple[Tried, ...]:
     """Screen all explanations of a fit's residual, and fit those that promise most.
 
-    Play is always fitted: its effect around a fit without it says little, as nothing moves within it. Around
-    a poor fit that is so for all of them, so no other is fitted then.
+    Play is always fitted: its effect around a fit without it says little, as nothing moves within it. So is a
+    lag: its linearised effect is that of a delay, which the fit has. Around a poor fit the effect says little
+    of all of them, so only play is fitted then.
 
     Args:
         problem: The problem.
@@ -153,7 +155,7 @@ def try_explanations(
         gains, enough = _gains(problem, refined, can, known)
     found = []
     for each, more in can.items():
-        fitted = each is PLAY or gains[each] > enough
+        fitted = each in (PLAY, LAG) or gains[each] > enough
         fitted = fitted and allows(each.name, wider_cost(problem, True, len(more)))
         found.append(Tried(each, problem, gains[each], fit_wider(problem, more) if fitted else None))
     return tuple(found)
