@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from deal_hw.calib.data.noise import autocorrelations
-from deal_hw.calib.report.gather import OverlayPanel, Residuals, Spread
+from deal_hw.calib.report.gather import OverlayPanel, ResidualOver, Residuals
 from deal_hw.calib.report.panels import Panel, Series, envelope, nice_step
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
@@ -110,7 +110,7 @@ def residuals(shown: Residuals) -> tuple[Markup, str]:
     return Markup("").join(rows), words
 
 
-def spread(shown: Sequence[Spread]) -> Markup:
+def spread(shown: Sequence[ResidualOver]) -> Markup:
     """Draw the size of residuals over the motion of their joints, one row for each channel."""
     largest: dict[str, float] = {}
     for one in shown:

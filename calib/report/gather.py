@@ -77,7 +77,7 @@ class Residuals:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spread:
+class ResidualOver:
     """Size of a channel's whitened residual in all fitted recordings, over a quantity of its joint.
 
     Attributes:
@@ -117,7 +117,7 @@ class ReportInputs:
     result: CalibrationResult
     overlays: tuple[OverlayPanel, ...] = ()
     residuals: tuple[Residuals, ...] = ()
-    spread: tuple[Spread, ...] = ()
+    spread: tuple[ResidualOver, ...] = ()
     drawing: RobotDrawing | None = None
     heldout: tuple[str, ...] = ()
     heldout_s: float = 0.0
@@ -143,7 +143,7 @@ def gather(
     """
     overlays: list[OverlayPanel] = []
     residuals: list[Residuals] = []
-    spread: list[Spread] = []
+    spread: list[ResidualOver] = []
     left_out: list[str] = []
     drawing = None
     # A recording that was cut into stretches is shown as one.
@@ -253,7 +253,7 @@ def _windows(problem: Problem, window_s: float) -> Iterator[WindowData]:
 
 def _residuals(
     problem: Problem, result: CalibrationResult, titles: Sequence[str]
-) -> tuple[list[Residuals], list[Spread]]:
+) -> tuple[list[Residuals], list[ResidualOver]]:
     centre = Members(result.estimate[None], np.array([result.latency_s]))
     M = len(problem.channels)
     length = max(min(samples_in(problem, WHITENED_S), WHITENED_SIZE // M), 2)
@@ -282,9 +282,9 @@ def _residuals(
 
 def _spread(
     problem: Problem, latency_s: float, power: FloatArray, at: Sequence[tuple[int, IntArray]]
-) -> list[Spread]:
+) -> list[ResidualOver]:
     """Return the size of the residual, (n, M), over the motion of the joints; ``at`` has its samples."""
-    found, of = list[Spread](), quantities(problem, latency_s)
+    found, of = list[ResidualOver](), quantities(problem, latency_s)
     for m, channel in enumerate(problem.channel_names):
         for one in of:
             if one.of != channel or one.kind == "time":
@@ -292,5 +292,7 @@ def _spread(
             values = np.concatenate([one.values[e][samples] for e, samples in at])
             middle, size = size_over(power[:, m], values)
             if np.isfinite(size).sum() > 1:
-                found.append(Spread(channel=channel, kind=one.kind, unit=one.unit, at=middle, size=size))
+                found.append(
+                    ResidualOver(channel=channel, kind=one.kind, unit=one.unit, at=middle, size=size)
+                )
     return found
