@@ -121,7 +121,8 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
         alarm = Finding.alarm(
             f"With another zero of its encoders ({each}) the model predicts motion that it was not fitted to "
             f"{better}.",
-            "The encoders' zeros are not the model's, by as much in all recordings: set-points are off, too.",
+            "The encoders' zeros are not the model's, by as much in all recordings. Set-points of servos are "
+            "off, too.",
             f"Use this result: it has the zeros as {listed([p.name for p in more])}. Or set the zeros in the "
             "model's pose, and record again.",
         )
