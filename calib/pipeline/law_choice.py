@@ -290,9 +290,7 @@ def take_laws(
     return found
 
 
-def explained_by_laws(
-    run: CalibrationRun, searched: CalibrationResult, laws: LawsTaken, start: Member
-) -> FitOutcome | None:
+def explained_by_laws(run: CalibrationRun, searched: CalibrationResult, laws: LawsTaken) -> FitOutcome | None:
     """Return the result of a fit of start states, too, where laws were taken and leave only noise then.
 
     Fits of predictions begin at smoothed states, whose errors bias them. A robot that its laws explain is
@@ -301,12 +299,11 @@ def explained_by_laws(
     Args:
         run: The calibration, with the parameters of the laws.
         searched: Result of the search, or its substitute.
-        laws: The laws.
-        start: Where the fit begins: values, (K,), and latency [s].
+        laws: The laws; the fit begins where theirs ended.
     """
-    if not laws.choices:
+    if laws.member is None:
         return None
-    fit = refined_from(run, *start)
+    fit = refined_from(run, *laws.member)
     if not conclusive(run.problem, fit):
         return None
     found = conclude_fit(run, searched, fit)

@@ -225,17 +225,18 @@ class OutputErrorFits(Fits):
             problem, (theta, latency_s) = laws.problem, laws.member
             # The local fit knows of no law.
             run = dataclasses.replace(run, problem=laws.widened(run.problem), local=None)
-        recipe = settings.recipe(choice.chosen)
-        with_latency = dataclasses.replace(recipe, latency=True)
-        fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
-        known = uncertainty_at(problem, fit, own_scale=True)
-        chi2, left = fit.chi2, None
+        chi2, left = np.nan, None
         if settings.mismatch_s:
             # With fitted start states the residual shows model error, not smoothing error.
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
             chi2 = left.normal.cost / max(left.normal.count, 1)
-            if chi2 <= FAR and (exact := explained_by_laws(run, searched, laws, (theta, latency_s))):
+            if chi2 <= FAR and (exact := explained_by_laws(run, searched, laws)):
                 return exact
+        recipe = settings.recipe(choice.chosen)
+        with_latency = dataclasses.replace(recipe, latency=True)
+        fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
+        known = uncertainty_at(problem, fit, own_scale=True)
+        chi2 = fit.chi2 if left is None else chi2
         local = None if run.local is None else with_rows(run.local)
         found: Diagnosed | None = None
         judged = run.problem, local

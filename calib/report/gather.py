@@ -289,8 +289,7 @@ def _spread(
         for one in of:
             if one.of != channel or one.kind == "time":
                 continue
-            values = np.concatenate([one.values[e][samples] for e, samples in at])
-            middle, size = size_over(power[:, m], values)
+            middle, size = size_over(power[:, m], one.at(at))
             if np.isfinite(size).sum() > 1:
                 found.append(
                     ResidualOver(channel=channel, kind=one.kind, unit=one.unit, at=middle, size=size)

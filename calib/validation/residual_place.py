@@ -7,7 +7,7 @@ load. Something that happened once lies in one stretch of time.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -61,6 +61,10 @@ class Quantity:
     of: str
     unit: str
     values: tuple[FloatArray, ...]
+
+    def at(self, rows: Sequence[tuple[int, IntArray]]) -> FloatArray:
+        """Return its values, (n,), at samples of recordings: the index of each and its samples."""
+        return np.concatenate([self.values[e][samples] for e, samples in rows])
 
     def between(self, low: float, high: float, *, either_way: bool = False) -> str:
         """Return in words where it is between two values, or its size, either way."""
@@ -156,7 +160,7 @@ def residual_place(problem: Problem, refined: Refined) -> str:
     def over(*, time: bool) -> Iterator[tuple[Quantity, FloatArray]]:
         for one in every:
             if (one.kind == "time") == time:
-                yield one, np.concatenate([one.values[e][samples] for e, samples in rows])[seen]
+                yield one, one.at(rows)[seen]
 
     # What happens once happens at some place, too, so a time is named only where no place is.
     found = densest(total, over(time=False)) or densest(total, over(time=True))
