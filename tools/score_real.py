@@ -34,7 +34,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import joined
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.run import calibrate_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 METHODS = ("nominal", "one-page", "mujoco-sysid", "no-laws", "default")
@@ -202,7 +202,6 @@ def fitted(
     robot: Robot, config: FilesSettings, work: CalibrationInput, method: str, seed: int
 ) -> tuple[ParameterSpace, Any, float, Row]:
     """Return a method's parameters, their values (K,), its latency [s], and more for the row."""
-    rng = np.random.default_rng(seed)
     if method == "nominal":
         return work.space, work.space.nominal, 0.0, {}
     if method in ("one-page", "mujoco-sysid"):
@@ -213,21 +212,12 @@ def fitted(
             return work.space, theta, latency_s, {}
         if work.robot.setups:
             raise ConfigurationError("mujoco.sysid has one model for all recordings")
-        found = with_delay(robot.fitted_s).run(problem, Budget(generations=SETTINGS.sysid_iterations), rng)
+        found = with_delay(robot.fitted_s).run(
+            problem, Budget(generations=SETTINGS.sysid_iterations), np.random.default_rng(seed)
+        )
         return work.space, found.estimate, found.latency_s, {}
-    result: CalibrationResult = calibrate_episodes(
-        work.robot,
-        work.space,
-        work.episodes,
-        work.holdout,
-        method=usual_method(config, work),
-        budget=Budget(),
-        rng=rng,
-        threads=1,
-        heldout_window_s=robot.window_s,
-        laws=method == "default",
-        guessed=work.guessed,
-    )
+    chosen = replace(config, seed=seed, threads=1, heldout_window=robot.window_s, laws=method == "default")
+    result: CalibrationResult = calibrate_input(chosen, work, usual_method(config, work))
     facts = {name: result.provenance.get(name) for name in ("laws", "candidates")}
     return (
         result.space,

@@ -28,8 +28,8 @@ from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
-from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.intake import calibration_input, usual_method
+from deal_hw.workflows.calibration.run import calibrate_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 KEY = ("task", "seed")
@@ -268,12 +268,18 @@ def run_cell(
     row: Row = {"bench": "first-answer", "task": name, "seed": seed, "error": "", "skipped": ""}
     with tempfile.TemporaryDirectory() as folder:
         try:
-            config = PROBLEMS[name](_Ask(Path(folder), seed, real, settings.seconds))
+            chosen = PROBLEMS[name](_Ask(Path(folder), seed, real, settings.seconds))
         except ConfigurationError as err:
             return row | {"skipped": str(err)}
+        config = replace(
+            chosen,
+            seed=seed,
+            threads=threads,
+            population=budget.population,
+            generations=budget.generations,
+        )
         with noted_in(row):
-            work = calibration_input(config)
-            row |= _compared(work, config, seed, budget, threads, settings)
+            row |= _compared(config, settings)
         return row
 
 
@@ -305,14 +311,7 @@ class _Shown:
     space: ParameterSpace
 
 
-def _compared(
-    work: CalibrationInput,
-    config: FilesSettings,
-    seed: int,
-    budget: Budget,
-    threads: int | None,
-    settings: FirstAnswerSettings,
-) -> Row:
+def _compared(config: FilesSettings, settings: FirstAnswerSettings) -> Row:
     from deal_hw.calib.baselines.sysid import with_delay
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.pipeline.methods import make_method
@@ -321,6 +320,7 @@ def _compared(
     from deal_hw.sim.recordings.parts import joined
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 
+    work = calibration_input(config)
     # Imports are not counted.
     method = usual_method(config, work)
     make_method(method, refine=True)
@@ -333,29 +333,18 @@ def _compared(
             space = progress.space or work.space
             shown.append(_Shown(progress.stage, *since.passed(), theta, latency_s, space))
 
-    result = calibrate_episodes(
-        work.robot,
-        work.space,
-        work.episodes,
-        work.holdout,
-        method=method,
-        budget=budget,
-        rng=np.random.default_rng(seed),
-        threads=threads,
-        progress=watch,
-        guessed=work.guessed,
-    )
+    result = calibrate_input(config, work, method, progress=watch)
     shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s, result.space))
 
     # Whole recordings, as far as they are fitted: its windows must not end where ours were cut.
-    whole = Problem(work.robot, work.space, joined(work.episodes), threads=threads)
+    whole = Problem(work.robot, work.space, joined(work.episodes), threads=config.threads)
     since = _Stopwatch.start()
     sysid = with_delay(settings.sysid_window_s).run(
-        whole, Budget(generations=settings.sysid_iterations), np.random.default_rng(seed)
+        whole, Budget(generations=settings.sysid_iterations), np.random.default_rng(config.seed)
     )
     sysid_s, sysid_cpu_s = since.passed()
 
-    held_out = HeldOut(work.robot, work.space, work.holdout, settings.window_s, threads)
+    held_out = HeldOut(work.robot, work.space, work.holdout, settings.window_s, config.threads)
     fits = {"sysid": (sysid.estimate, sysid.latency_s), "nominal": (work.space.nominal, 0.0)}
     errors = held_out.errors(fits).mean()
     ours = [held_out.of(fit.space).errors({"fit": (fit.theta, fit.latency_s)}).mean()["fit"] for fit in shown]

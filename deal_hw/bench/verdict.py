@@ -38,7 +38,7 @@ from deal_hw.testing.plain_faults import (
 )
 from deal_hw.testing.plain_robots import KINDS, PlainRobot, can_have, make_robot, shared_words, write
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.run import calibrate_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 KEY = ("task", "fault", "seed")
@@ -104,24 +104,21 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
     row: dict[str, Any] = {"bench": "verdict", "task": kind, "fault": fault, "seed": seed, "error": ""}
     with tempfile.TemporaryDirectory() as name:
         model, fit, held_out = write(robot, Path(name))
-        config = FilesSettings(model=model, data=fit, holdout=held_out)
+        config = FilesSettings(
+            model=model,
+            data=fit,
+            holdout=held_out,
+            seed=seed,
+            threads=threads,
+            population=budget.population,
+            generations=budget.generations,
+        )
         try:
             work = calibration_input(config, say=messages.append)
             if why := outside_range(work.space, robot.truth):
                 return row | {"error": f"ConfigurationError: {why}"}
-            method = usual_method(config, work)
-            result = calibrate_episodes(
-                work.robot,
-                work.space,
-                work.episodes,
-                work.holdout,
-                method=method,
-                budget=budget,
-                rng=np.random.default_rng(seed),
-                threads=threads,
-                progress=_ends_when_named if _shared(fault) else None,
-                guessed=work.guessed,
-            )
+            ends = _ends_when_named if _shared(fault) else None
+            result = calibrate_input(config, work, usual_method(config, work), progress=ends)
         except _NamedError as end:
             messages.append(str(end))
             row |= {"colour": "said", "named": names(kind, fault, [], messages), "said": messages}
