@@ -101,9 +101,11 @@ def setpoints(
     """
     if batch.robot.description.actuation == "motor":
         # Efforts are not slewed; before the first one the motors are off.
-        efforts = np.repeat(episode.target[None], batch.count, axis=0) if target is None else target
-        late = delay(efforts, batch.lag_s(latency_s) / episode.step_s, np.zeros_like(efforts[:, 0]))
-        return _acting(batch, late, np.zeros_like(efforts[:, 0]), episode.step_s)
+        efforts = episode.target[None] if target is None else target
+        member = np.zeros(batch.count, dtype=np.int64) if target is None else np.arange(batch.count)
+        off = np.zeros((batch.count, efforts.shape[2]))
+        late = _delayed(efforts, member, batch.lag_s(latency_s) / episode.step_s, off)
+        return _acting(batch, late, off, episode.step_s)
     factors = batch.servo_factor("servo_speed_limit")
     if target is None:
         # Members with the same limit have the same set-point; most spaces have one limit for all.
@@ -114,8 +116,23 @@ def setpoints(
     rate = factors[:, None] * episode.speed_limit[None] * episode.step_s
     path = slew(np.repeat(episode.start_setpoint[None], len(factors), axis=0), target, rate)
     start = np.repeat(episode.start_setpoint[None], batch.count, axis=0)
-    path = delay(path[member.ravel()], batch.lag_s(latency_s) / episode.step_s, start)
+    path = _delayed(path, member.ravel(), batch.lag_s(latency_s) / episode.step_s, start)
     return _acting(batch, path, start, episode.step_s)
+
+
+def _delayed(path: FloatArray, member: IntArray, latency_steps: FloatArray, before: FloatArray) -> FloatArray:
+    """Return each member's delayed set-point, (N, S, A); equal ones are computed once.
+
+    Args:
+        path: Set-points, (U, S, A).
+        member: Row of each member there, (N,).
+        latency_steps: Latency of each member, (N,), or of each of its actuators, (N, A).
+        before: Set-point of each member before the first step, (N, A).
+    """
+    each = latency_steps.reshape(len(member), -1)
+    of = np.column_stack([member, each, before])
+    _, first, same = np.unique(of, axis=0, return_index=True, return_inverse=True)
+    return delay(path[member[first]], each[first], before[first])[same.ravel()]
 
 
 def _acting(batch: ServoBatch, path: FloatArray, start: FloatArray, step_s: float) -> FloatArray:
