@@ -15,6 +15,9 @@ import numpy as np
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 
+EFFORT_UNITS: Final[Mapping[str, str]] = {"m": "N", "rad": "N·m"}
+"""Unit of a joint's effort by that of its position."""
+
 ACTUATIONS: Final = ("position", "motor")
 """Kinds of actuator commands: set-points of a PD position loop, or efforts as a share of the limit."""
 

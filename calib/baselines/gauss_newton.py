@@ -21,7 +21,8 @@ from deal_hw.calib.data.innovations import (
     linearise,
     whitened_residual,
 )
-from deal_hw.calib.data.problem import Problem, measurements
+from deal_hw.calib.data.parts import measurements
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.search import Search, SearchLog, Stepper
 from deal_hw.calib.fit.intervals import kinks_of, uncertainty
 from deal_hw.calib.fit.residual import LATENCY_STEP_S, PARAMETER_STEP, Normal, value_bounds

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.parts import taken
-from deal_hw.calib.data.problem import Problem, WindowData, longest_windows
+from deal_hw.calib.data.parts import longest_windows, taken
+from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.data.recording.excitation import SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.engine.batch import COMMAND_DELAY

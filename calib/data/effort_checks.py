@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, longest_windows
+from deal_hw.calib.data.parts import longest_windows
+from deal_hw.calib.data.problem import Problem
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.noise import NOISE_FREE_STD
-from deal_hw.calib.data.problem import Problem, WindowData, measurements
+from deal_hw.calib.data.parts import measurements
+from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints

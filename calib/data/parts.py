@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.errors import InsufficientDataError
 
 BEGIN_S = 8.0
 """Length of data on which a fit or a search begins [s]: it shows the neighbourhood."""
@@ -34,3 +36,29 @@ def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
     late = None if data.late is None else data.late[chosen]
     values = {name: getattr(data, name)[chosen] for name in names}
     return dataclasses.replace(data, windows=windows, late=late, **values)
+
+
+def measurements(windows: Sequence[WindowData]) -> int:
+    """Return the number of measurements in windows."""
+    return sum(int(np.count_nonzero(data.reported)) for data in windows)
+
+
+def samples_in(problem: Problem, seconds: float) -> int:
+    """Return the number of samples in a time: at least 1 from known start states, 4 from fitted ones."""
+    return max(round(seconds / problem.episodes[0].period_s), 1 if problem.noise_free else 4)
+
+
+def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
+    """Cut windows of ``seconds``, or shorter ones where no recording holds one.
+
+    Raises:
+        InsufficientDataError: Even windows of four samples do not fit.
+    """
+    length = max(round(seconds / problem.episodes[0].period_s), 4)
+    while True:
+        try:
+            return problem.windows(length)
+        except InsufficientDataError:
+            if length <= 4:
+                raise
+            length = max(int(0.8 * length), 4)

@@ -26,12 +26,14 @@ from deal_hw.calib.data.noise import (
     white_noise_std,
 )
 from deal_hw.calibration import LATENCY_RANGE_S
+from deal_hw.description import EFFORT_UNITS
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
 from deal_hw.sim.engine.effort import effort_joints
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.trees import independent_trees, reached
 from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.parameters.effort import EFFORT_NOISE
 from deal_hw.sim.recordings.episode import SampledEpisode, fill_gaps
@@ -204,6 +206,8 @@ class Problem:
             entries only.
         noise: Noise at rest, and jitter of the sample times.
         starts: Smoothed states of each episode.
+        trees: Number of each coordinate's tree, (C,) an episode; the same one for those that act on each
+            other.
     """
 
     robot: RobotModel
@@ -223,6 +227,7 @@ class Problem:
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
     starts: list[StartStates] = field(init=False)
+    trees: list[IntArray] = field(init=False)
     engine: EngineName = "mujoco"
     guessed: tuple[str, ...] = ()
     _batches: BatchPool = field(init=False)
@@ -251,6 +256,8 @@ class Problem:
         rotation = self.robot.rotation
         self.starts = [smooth_states(e, self.noise_std, rotation, self.smoothing_s) for e in self.episodes]
         self.noise = self._noise_model()
+        models = [self.robot.in_setup(e.setup) for e in self.episodes]
+        self.trees = [independent_trees(m, e.position) for m, e in zip(models, self.episodes, strict=True)]
 
     def _white_noise(self) -> FloatArray:
         size, states = 2 * self.coordinates, self.episodes[0].channels
@@ -408,6 +415,11 @@ class Problem:
         return int(self.episodes[0].position.shape[1])
 
     @property
+    def independent(self) -> int:
+        """Number of trees that do not act on each other, the least of all episodes."""
+        return min(len(np.unique(trees)) for trees in self.trees)
+
+    @property
     def commands(self) -> int:
         """Commands A of a control period."""
         return int(self.episodes[0].target.shape[1])
@@ -422,11 +434,17 @@ class Problem:
         return tuple(every[c] for c in self.channels)
 
     @property
+    def channel_coordinates(self) -> IntArray:
+        """The coordinate of each measured channel, (M,)."""
+        first, every = self.coordinates - len(self.robot.description.joint_names), np.arange(self.coordinates)
+        return np.concatenate([every, every, first + np.array(self.efforts, dtype=np.int64)])[self.channels]
+
+    @property
     def channel_units(self) -> tuple[str, ...]:
         """Units of the measured channels, (M,)."""
         units = self.robot.coordinate_units
         joints = self.robot.description.position_units
-        efforts = ("N" if joints[j] == "m" else "N·m" for j in self.efforts)
+        efforts = (EFFORT_UNITS[joints[j]] for j in self.efforts)
         every = (*units, *(f"{unit}/s" for unit in units), *efforts)
         return tuple(every[c] for c in self.channels)
 
@@ -443,10 +461,10 @@ class Problem:
             return [self.batch(count, index, population=True)]
         return self._batches.parts(count, self.episodes[index].setup)
 
-    def acts(self, index: int) -> Mask:
-        """Return which free parameters act on an episode, (K,); others are of other set-ups."""
-        here = self.robot.in_setup(self.episodes[index].setup).acting(self.space)
-        return np.array([bool(p.elements) for p in here.free], dtype=bool)
+    def reach(self, index: int) -> Mask:
+        """Return which coordinates each free parameter moves in an episode, (K, C); in other set-ups none."""
+        here = self.robot.in_setup(self.episodes[index].setup)
+        return reached(here, here.acting(self.space), self.trees[index])
 
     def measured(self, index: int) -> FloatArray:
         """Return the measured channels of an episode, (T, M)."""
@@ -572,29 +590,3 @@ class Problem:
         speeds = channels[(channels >= C) & (channels < 2 * C)] - C
         parts = [x[..., channels[channels < C]], v[..., speeds], *([] if effort is None else [effort])]
         return MemberPrediction(np.concatenate(parts, axis=-1), x, v)
-
-
-def samples_in(problem: Problem, seconds: float) -> int:
-    """Return the number of samples in a time: at least 1 from known start states, 4 from fitted ones."""
-    return max(round(seconds / problem.episodes[0].period_s), 1 if problem.noise_free else 4)
-
-
-def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
-    """Cut windows of ``seconds``, or shorter ones where no recording holds one.
-
-    Raises:
-        InsufficientDataError: Even windows of four samples do not fit.
-    """
-    length = max(round(seconds / problem.episodes[0].period_s), 4)
-    while True:
-        try:
-            return problem.windows(length)
-        except InsufficientDataError:
-            if length <= 4:
-                raise
-            length = max(int(0.8 * length), 4)
-
-
-def measurements(windows: Sequence[WindowData]) -> int:
-    """Return the number of measurements in windows."""
-    return sum(int(np.count_nonzero(data.reported)) for data in windows)

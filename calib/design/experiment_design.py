@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, longest_windows
+from deal_hw.calib.data.parts import longest_windows
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.design.closed_loop import Scenario, TrialRunner
 from deal_hw.calib.fit.residual import Shooting, States
 from deal_hw.description import RobotDescription

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deal_hw.calib.data.noise import FLOOR_STD, Mask
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.parts import samples_in
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import EXPLAINED, STAGES_S, Refined, refine
 from deal_hw.calib.fit.solver import channel_scale
 from deal_hw.errors import InsufficientDataError

@@ -17,7 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Member, Problem, WindowData, longest_windows
+from deal_hw.calib.data.parts import longest_windows
+from deal_hw.calib.data.problem import Member, Problem, WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting
 from deal_hw.calib.fit.solver import (
     SolverSettings,

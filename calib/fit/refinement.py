@@ -12,8 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from deal_hw.calib.data.parts import BEGIN_S, part_of
-from deal_hw.calib.data.problem import Member, Problem, samples_in
+from deal_hw.calib.data.parts import BEGIN_S, part_of, samples_in
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.contacts import START_ITERATIONS, fit_starts, solve_contacts
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, States
 from deal_hw.calib.fit.solver import SolverSettings, cauchy_windows, converged, restarted, solve

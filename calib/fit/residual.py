@@ -25,8 +25,10 @@ from functools import cached_property
 
 import numpy as np
 
+from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
 from deal_hw.calib.fit.command_delays import with_command_delays
+from deal_hw.sim.engine.trees import sharing
 from deal_hw.sim.parameters.laws import SERVO_PUNCH, SERVO_RESOLUTION
 from deal_hw.types import FloatArray
 
@@ -168,7 +170,14 @@ class Shooting:
             with_command_delays(problem, problem.windows(length)) if data is None else data
         )
         self.length = length
-        self._acts = [problem.acts(d.episode) for d in self.data]
+        # Which coordinates each entry of (p, s_w) moves, (K + 1 + 2 C, C), and with which each channel moves.
+        joined = [problem.trees[d.episode][:, None] == problem.trees[d.episode] for d in self.data]
+        late = np.ones((1, problem.coordinates), dtype=bool)
+        self._reach = [
+            np.concatenate([problem.reach(d.episode), late, own, own])
+            for d, own in zip(self.data, joined, strict=True)
+        ]
+        self._moved_with = problem.channel_coordinates
         # The last point whose predictions are known, and these: (W, H, M) an episode.
         self._known: tuple[Point | None, list[FloatArray]] = (None, [])
         space = problem.space
@@ -273,7 +282,6 @@ class Shooting:
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.given else C
         members = K + 1 + 2 * moved
-        values = np.repeat(point.value[None], members, axis=0)
         steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
         steps = stretch * steps[:members]
         # A negative latency or friction is no model: there, differences are taken inwards.
@@ -282,7 +290,6 @@ class Shooting:
         steps[: K + 1] *= np.where(outside, -1.0, 1.0)
         before = point.value - steps[: K + 1]
         one_sided = np.concatenate([outside | (before < low) | (before > high), np.zeros(2 * moved, bool)])
-        values[: K + 1] += np.diag(steps[: K + 1])
         # The prior's part: H = P, g = P (p - q).
         expected = point.value - self.prior_mean
         hessian, gradient = np.diag(self.prior_information), self.prior_information * expected
@@ -292,30 +299,14 @@ class Shooting:
         residuals: list[FloatArray] = []
         base = self._observed(point)
         for e, data in enumerate(self.data):
-            x = np.repeat(point.position[e][None], members, axis=0)
-            v = np.repeat(point.velocity[e][None], members, axis=0)
-            for c in range(moved):
-                x[K + 1 + c, :, c] += steps[K + 1 + c]
-                v[K + 1 + C + c, :, c] += steps[K + 1 + C + c]
-            # Row n of `values`, `x` and `v` has entry n of (p, s_w) changed by its step, in all windows at
-            # once: windows do not share start states.
-            acting = np.append(self._acts[e], np.ones(1 + 2 * moved, dtype=bool))
+            acting = np.asarray(self._reach[e][:members].any(axis=1))
             acting[: K + 1] &= not states_only
-            predicted = self._predict(values[acting], data, x[acting], v[acting]).observed
             r = data.whitened(base[e] - data.measured)
-            difference = predicted - base[e]
+            difference = self._changes(e, point, steps, acting)
             if central:
-                here_x, here_v = point.position[e], point.velocity[e]
-                at = (
-                    (2 * point.value - values)[acting],
-                    data,
-                    (2 * here_x - x)[acting],
-                    (2 * here_v - v)[acting],
-                )
-                other = self._predict(*at).observed
                 two = ~one_sided[acting]
                 # (y(p + h) - y(p - h)) / 2; divided by h below, as y(p + h) - y(p) is.
-                difference[two] = (predicted - other)[two] / 2
+                difference[two] = (difference - self._changes(e, point, -steps, acting))[two] / 2
             jac = np.moveaxis(data.whitened(difference), 0, -1) / steps[acting]
             if not acting.all():
                 # Parameters of other set-ups change nothing here, and are not simulated.
@@ -474,6 +465,28 @@ class Shooting:
             draw[1::2] += smoothed - np.concatenate([point.position[e], point.velocity[e]], axis=1)
             ways.append(draw)
         return self.moved(point, point.value, ways)
+
+    def _changes(self, e: int, point: Point, steps: FloatArray, chosen: Mask) -> FloatArray:
+        """Return what n changes do to an episode's predictions at a point, (n, W, H, M).
+
+        Each is of one entry of (p, s_w), in all windows at once: windows do not share start states. Changes
+        that move different coordinates are made in one simulation.
+
+        Args:
+            e: The episode.
+            point: The point.
+            steps: The step of each entry, (K + 1 + S,).
+            chosen: The n entries, likewise.
+        """
+        entries, reach = np.flatnonzero(chosen), self._reach[e][: len(chosen)][chosen]
+        number, P, C = sharing(reach), len(point.value), self.problem.coordinates
+        together = np.zeros((number.max(initial=-1) + 1, P + 2 * C))
+        together[number, entries] = steps[chosen]
+        x = point.position[e] + together[:, None, P : P + C]
+        v = point.velocity[e] + together[:, None, P + C :]
+        predicted = self._predict(point.value + together[:, :P], self.data[e], x, v).observed
+        found = predicted[number] - self._observed(point)[e]
+        return np.asarray(np.where(reach[:, self._moved_with][:, None, None], found, 0.0))
 
     def _predict(
         self, values: FloatArray, data: WindowData, x: FloatArray, v: FloatArray

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.noise import Mask
-from deal_hw.calib.data.problem import Member, Problem, samples_in
+from deal_hw.calib.data.parts import samples_in
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, latency_end
 from deal_hw.calib.fit.output_error import (
     Recipe,

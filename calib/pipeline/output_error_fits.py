@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Member, Problem, samples_in
+from deal_hw.calib.data.parts import samples_in
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import (
     MISMATCH_CHI2,
     Uncertainty,
@@ -442,7 +443,7 @@ class OutputErrorFits(Fits):
         from deal_hw.calib.validation.checks import HALVES, SplitHalf, agreement
         from deal_hw.calib.validation.cross_validation import fold_masks
 
-        before, values = problem.steps, len(problem.space) + 1
+        before, values = problem.steps, 1 + len(problem.space) / problem.independent
         # Derivatives by each value and the latency, each with its steps; central ones at the end.
         members = HALF_DERIVATIVES * (values + 1 + SECANTS) + 2 * values
         substeps = problem.episodes[0].step_s / problem.robot.step_s

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, WindowData, samples_in
+from deal_hw.calib.data.parts import samples_in
+from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros, zeros_of
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel

@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, samples_in
+from deal_hw.calib.data.parts import samples_in
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace

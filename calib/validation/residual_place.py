@@ -16,6 +16,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calibration import percent
+from deal_hw.description import EFFORT_UNITS
 from deal_hw.sim.engine.inverse_dynamics import link_torques
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray, IntArray
@@ -120,8 +121,7 @@ def quantities(problem: Problem, latency_s: float) -> list[Quantity]:
             acting = tuple(_acting(e, latency_s)[:, driven[name]] for e in problem.episodes)
             found.append(Quantity("command", name, own, acting))
         if loads:
-            force = "N" if unit == "m" else "N·m"
-            found.append(Quantity("load", name, force, tuple(load[:, j] for load in loads)))
+            found.append(Quantity("load", name, EFFORT_UNITS[unit], tuple(load[:, j] for load in loads)))
     for e, episode in enumerate(problem.episodes):
         times = [np.broadcast_to(np.nan, len(other.sample)) for other in problem.episodes]
         times[e] = episode.time_s

@@ -18,7 +18,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, measurements, samples_in
+from deal_hw.calib.data.parts import measurements, samples_in
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.validation.candidates import Candidate

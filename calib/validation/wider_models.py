@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deal_hw.calib.data.parts import BEGIN_S, part_of
-from deal_hw.calib.data.problem import Member, Problem, samples_in
+from deal_hw.calib.data.parts import BEGIN_S, part_of, samples_in
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -125,8 +125,8 @@ def wider_cost(problem: Problem, fits: bool, more: int = 0) -> float:
     """
     total_s = sum(len(e.sample) * e.period_s for e in problem.episodes)
     periods = min(BEGIN_S, total_s / 2) / problem.robot.step_s
-    # Derivatives by each value and start state, and a line of damped steps.
-    members = 2 + len(problem.space) + more + 2 * problem.coordinates + 10
+    # Derivatives by each value and start state, of independent trees at once, and a line of damped steps.
+    members = 12 + (len(problem.space) + more + 2 * problem.coordinates) / problem.independent
     predictions = total_s / problem.robot.step_s
     return 6.0 * members * periods * (2 if fits else 1) + 2.0 * predictions
 

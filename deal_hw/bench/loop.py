@@ -100,7 +100,8 @@ def calibration_row(
 
 def _intervals(case: Case, result: CalibrationResult, threads: int | None) -> tuple[float, float | None]:
     """Return coverage90 and width90; without noise there is no bound for a width."""
-    from deal_hw.calib.data.problem import Problem, samples_in
+    from deal_hw.calib.data.parts import samples_in
+    from deal_hw.calib.data.problem import Problem
 
     if case.channel_std is None:
         inside = (result.interval[:, 0] <= case.theta) & (case.theta <= result.interval[:, 1])

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from deal_hw.data.recording.reader import CycleTable
-from deal_hw.description import RobotDescription
+from deal_hw.description import EFFORT_UNITS, RobotDescription
 from deal_hw.sim.recordings.overlay import Overlay
 from deal_hw.types import BodyTrajectory, FloatArray, Trajectory
 from deal_hw.viz import palette
@@ -199,7 +199,7 @@ def _commands(trajectory: Trajectory, description: RobotDescription) -> Any:
             ),
         )
         effort = Plot(
-            name=f"{joint} effort [{'N' if unit == 'm' else 'N·m'}]",
+            name=f"{joint} effort [{EFFORT_UNITS[unit]}]",
             origin=f"/joints/{joint}/effort",
             curves=((trajectory.device_s, trajectory.effort[:, a]),),
         )

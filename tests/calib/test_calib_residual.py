@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -97,3 +99,47 @@ def test_a_window_may_start_where_the_one_before_it_ends(small_problem: Callable
         for found, start, expected in zip((x, v), own[e], through[e], strict=True):
             np.testing.assert_allclose(found[first + 20], expected[first + 20], rtol=1e-9)
             assert not np.array_equal(found[first + 20], start[first + 20])
+
+
+TWO = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body><joint name="left" axis="0 1 0" damping=".05" armature=".01" frictionloss=".02"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5"/></body>
+  <body pos="0 1 0"><joint name="right" axis="0 1 0" damping=".05" armature=".01" frictionloss=".02"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".4"/></body>
+</worldbody><actuator><position name="left" joint="left" kp="8"/>
+  <position name="right" joint="right" kp="8"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize("central", [False, True])
+def test_independent_pendulums_share_simulations(tmp_path: Path, central: bool) -> None:
+    """Eight parameters, a latency and four entries of start states: 7 simulations instead of 13."""
+    model, rng = mujoco.MjModel.from_xml_string(TWO), np.random.default_rng(0)
+    data, rows = mujoco.MjData(model), []
+    for k in range(250):
+        data.ctrl[:] = 0.5 * np.sin(0.13 * k), 0.4 * np.sin(0.17 * k)
+        rows.append([0.01 * k, *(data.qpos + 1e-4 * rng.standard_normal(2)), *data.ctrl])
+        mujoco.mj_step(model, data, 5)
+    names = ("time", "left_pos", "right_pos", "left_cmd", "right_cmd")
+    np.savetxt(tmp_path / "r.csv", rows, delimiter=",", header=",".join(names), comments="")
+    (tmp_path / "two.xml").write_text(TWO, encoding="utf-8")
+    settings = FilesSettings(
+        model=tmp_path / "two.xml", data=(tmp_path / "r.csv",), holdout_part=0.0, threads=1
+    )
+    work = calibration_input(settings)
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    assert problem.trees[0].tolist() == [0, 1] and len(problem.space) == 8
+    alone = copy.copy(problem)
+    alone.trees = [np.zeros(2, dtype=np.int64)]
+    steps, found = [], []
+    for of in (problem, alone):
+        shooting = Shooting(of, 20)
+        point = shooting.start(of.space.nominal, 0.004)
+        shooting.cost(point)
+        before = of.steps
+        found.append(shooting.normal(point, keep=True, central=central))
+        steps.append(of.steps - before)
+    assert steps[0] * 13 == steps[1] * 7
+    together, apart = (f.rows[0] for f in found)
+    for mine, other in ((together.parameter, apart.parameter), (together.start, apart.start)):
+        np.testing.assert_allclose(mine, other, rtol=1e-6, atol=1e-6 * np.abs(other).max())

@@ -13,7 +13,7 @@ from deal_hw.parameters import Scale
 from deal_hw.sim.parameters.fields import Array, Fields
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-_OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 RATIO = 5.0
 """Usual accuracy of a published model: a factor on either side."""
@@ -91,9 +91,7 @@ class Kind:
 
 def joint_of(model: Any, actuator: int) -> int:
     """Return the joint that an actuator drives, or -1."""
-    return (
-        int(model.actuator_trnid[actuator, 0]) if int(model.actuator_trntype[actuator]) in _OF_JOINT else -1
-    )
+    return int(model.actuator_trnid[actuator, 0]) if int(model.actuator_trntype[actuator]) in OF_JOINT else -1
 
 
 def one_dof_joint(model: Any, joint: int, name: str) -> None:

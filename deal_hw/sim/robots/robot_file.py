@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 import yaml
 
+from deal_hw.description import EFFORT_UNITS
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import NAMES, read_yaml, reading
 from deal_hw.schema import FINITE, Tagged, from_values, refusal
@@ -259,7 +260,7 @@ def write_robot_file(robot: RobotFile) -> str:
 
 
 def _joint_lines(joint: JointEntry) -> list[str]:
-    unit, effort = joint.unit, "N·m" if joint.unit == "rad" else "N"
+    unit, effort = joint.unit, EFFORT_UNITS[joint.unit]
     fields = [
         ("unit", unit, "rad: hinge; m: slide"),
         ("default_position", joint.default_position, f"[{unit}]"),

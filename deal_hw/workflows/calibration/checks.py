@@ -217,7 +217,8 @@ def sensitive_parameters(
         require_sensitive,
         target_changes,
     )
-    from deal_hw.calib.data.problem import Problem, samples_in
+    from deal_hw.calib.data.parts import samples_in
+    from deal_hw.calib.data.problem import Problem
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
     # Raises if not even one window of that length fits.
