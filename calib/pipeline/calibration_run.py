@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.output_error import OutputErrorFit
     from deal_hw.calib.fit.refinement import Refined
     from deal_hw.calib.validation.explain import Tried
+    from deal_hw.calib.validation.explanations import Explanation
 
 SHARED_ERRORS = "errors that commands and measurements share"
 EXPLANATIONS = "laws that the model lacks"
@@ -81,6 +82,7 @@ class CalibrationRun:
         first_steps: Physics steps of the problem before this calibration.
         checks: Physics steps of each check so far, by its name.
         left_out: Why checks were left out, by their names.
+        inexact: Names of laws whose exact fit to all recordings left more than noise.
     """
 
     problem: Problem
@@ -94,6 +96,7 @@ class CalibrationRun:
     first_steps: int = 0
     checks: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    inexact: set[str] = field(default_factory=set)
     _begun: list[int] = field(default_factory=list)
 
     @contextlib.contextmanager
@@ -146,6 +149,16 @@ class CalibrationRun:
         """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""
         if self.progress is not None:
             self.progress(Progress(stage, done, total, message, **candidate))
+
+    def takes(self, explanation: Explanation) -> bool:
+        """Return whether the result may have an explanation: without laws, what an MJCF can say."""
+        from deal_hw.calib.validation.explanations import ZEROS
+
+        return self.settings.laws or explanation in ZEROS
+
+    def ask(self, law: str) -> None:
+        """Report that a law is tried."""
+        self.say(EXPLANATIONS, f"does {law} predict motion that it was not fitted to?")
 
     def say_search(self, why: str = "") -> None:
         """Report that the search begins, of which kind, and why; nothing where it stands in for none."""

@@ -302,7 +302,7 @@ def explained_by_laws(run: CalibrationRun, searched: CalibrationResult, laws: La
         searched: Result of the search, or its substitute.
         laws: The laws; the fit begins where theirs ended.
     """
-    if laws.member is None:
+    if laws.member is None or {law.explanation.name for law, _ in laws.choices} <= run.inexact:
         return None
     fit = refined_from(run, *laws.member)
     if not conclusive(run.problem, fit):
@@ -372,7 +372,7 @@ def screened_laws(
             law, then others. The fit of the half without one begins at the first, with as many derivatives.
         seconds: Windows of the candidates [s]: the first are those of these fits and their predictions.
     """
-    can, fit = applicable(problem), fits[0]
+    can, fit = {law: more for law, more in applicable(problem).items() if run.takes(law)}, fits[0]
     if LATENCY not in problem.guessed and latency_end(problem, fit[1], problem.latency_range_s):
         # A latency beyond a range that somebody gave is the simpler explanation, and an alarm asks for it. A
         # guessed range has grown as far as that gains.
@@ -389,7 +389,7 @@ def screened_laws(
         except InsufficientDataError:
             return ScreenedLaws()
         for law, more in can.items():
-            run.say(EXPLANATIONS, f"does {law.name} predict motion that it was not fitted to?")
+            run.ask(law.name)
             member = _with_law(part.with_more(more), more, fits, recipe)
             if member is None:
                 continue

@@ -178,7 +178,7 @@ class OutputErrorFits(Fits):
 
     def tries_laws(self, run: CalibrationRun) -> bool:
         """Return whether the cross-validation has candidates with laws."""
-        return run.settings.laws and run.settings.cross_validation
+        return run.settings.cross_validation
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
@@ -250,7 +250,7 @@ class OutputErrorFits(Fits):
                     allows: Allows = run.allows
                     if self.tries_laws(run):
                         # The cross-validation has judged laws already.
-                        allows = refused(allows, [law.name for law in EXPLANATIONS])
+                        allows = refused(allows, [law.name for law in EXPLANATIONS if run.takes(law)])
                     found = diagnose(judged[0], judged[1], run.tried, allows)
             split = self._split_half(run, problem, fit, recipe, known)
         known = checks.widened_by_split_half(known, split, latency_s, problem.latency_range_s)

@@ -193,7 +193,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             later = local is not None and local.chi2 > FAR and self.fits.tries_laws(run)
             if local is not None and self.settings.diagnosis and not later:
                 with run.check(EXPLANATIONS):
-                    tried = try_explanations(problem, with_rows(local), run.may_try)
+                    tried = try_explanations(problem, with_rows(local), run.may_try, say=run.ask)
                 run = dataclasses.replace(run, tried=tried)
             found = with_explanation(run) or with_shared_error(fits, run)
         found = found if zeros is None else zeros.said(found)
@@ -300,14 +300,16 @@ def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
     """
     from deal_hw.calib.validation.checks import unexplained
     from deal_hw.calib.validation.explain import try_explanations
+    from deal_hw.calib.validation.explanations import ZEROS
 
-    if not (run.settings.diagnosis and run.settings.laws and unexplained(refined)):
+    takes = run.settings.laws or any(each.parameters(run.problem) for each in ZEROS)
+    if not (run.settings.diagnosis and takes and unexplained(refined)):
         return run
     if run.local is not None and np.array_equal(run.local.theta, refined.theta):
         return run
     refined = with_rows(refined)
     with run.check(EXPLANATIONS):
-        tried = try_explanations(run.problem, refined, run.allows)
+        tried = try_explanations(run.problem, refined, run.allows, say=run.ask)
     return dataclasses.replace(run, local=refined, tried=tried)
 
 
@@ -480,16 +482,19 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     from deal_hw.calib.validation.candidates import law_candidates, ranked
     from deal_hw.calib.validation.explain import explained, rivals
 
-    if run.local is None or not run.tried or not run.settings.laws:
+    tried = [one for one in run.tried if run.takes(one.explanation)]
+    if run.local is None or not tried:
         return None
     with run.check(EXPLANATIONS):
-        found = explained(run.problem, run.local, run.tried)
+        found = explained(run.problem, run.local, tried)
     if not found or not found[0].explains:
         return None
     best, *others = rivals(found)
     wide = dataclasses.replace(run, problem=best.problem, progress=None)
+    run.say("fit", f"{best.explanation.name} on all recordings")
     fit = refined_from(wide, best.theta, best.latency_s)
     if not conclusive(best.problem, fit):
+        run.inexact.add(best.explanation.name)
         return None
     do = best.explanation.taken.replace("{}", listed(best.added))
     if others:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, advice, stret
 from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
 from deal_hw.calib.validation.explain import (
     DECISIVE,
-    SURE,
     Allows,
     Tried,
     explained,
@@ -38,10 +37,9 @@ from deal_hw.calib.validation.explain import (
 from deal_hw.calib.validation.random_delay import random_delay
 from deal_hw.calib.validation.recording_zeros import named_zeros
 from deal_hw.calib.validation.signatures import Cause, Signature, masses
-from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost, zero_parameters
+from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost
 from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
-from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
 NOTICED = 0.03
@@ -80,9 +78,6 @@ BURST_LEFT = 4.0
 """Chi2 that bursts may leave: twice the noise [-]."""
 
 
-ZEROS = "what is 0 in the model"
-"""Name of a check."""
-
 MASS = "another mass"
 """Name of a check."""
 
@@ -94,14 +89,6 @@ def all_allowed(name: str, steps: float) -> bool:
     """Allow every check."""
     del name, steps
     return True
-
-
-ZERO_CAUSES: Mapping[str, Cause] = {
-    "dof_armature": "inertia",
-    "dof_frictionloss": "friction",
-    "dof_damping": "damping",
-}
-"""Cause that a parameter stands for which is 0 in the model."""
 
 
 def diagnose(
@@ -121,15 +108,7 @@ def diagnose(
     known = functools.cache(lambda: evidence(problem, refined))
     tried = try_explanations(problem, refined, allows, tried, known)
     laws = explained(problem, refined, tried)
-    wider, zeros = [one.diagnosis for one in laws], list[Diagnosis]()
-    rows = list[Candidate]()
-    if not any(one.share >= DECISIVE for one in wider):
-        more = [] if problem.noise_free else zero_parameters(problem)
-        if more and allows(ZEROS, wider_cost(problem, True)):
-            zeros = find_zero(problem, refined, more)
-            if not zeros:
-                rows.append(Candidate(explanation=ZEROS, judged="fit", outcome="chance"))
-    wider += zeros
+    wider, rows = [one.diagnosis for one in laws], list[Candidate]()
     found, effects = [one for one in wider if one.share >= DECISIVE], list[Diagnosis]()
     unsure = np.zeros(0)
     if not found:
@@ -141,7 +120,6 @@ def diagnose(
         rows += effect_candidates(known(), effects)
         if refined.chi2 <= POOR:
             unsure = unsure_shift(known(), {one.code for one in found})
-    rows += [Candidate.of(ZEROS, "fit", one, "named" if one in found else "not named") for one in zeros]
     rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
     return Diagnosed(tuple(found), ranked(rows), unsure)
 
@@ -166,36 +144,6 @@ def weighs(problem: Problem, refined: Refined, cause: Diagnosis, allows: Allows)
 def supported(share: float, chi2: float) -> bool:
     """Return whether a cause that explains a share of a residual is more than an accident of a poor fit."""
     return share >= DECISIVE or chi2 * (1 - share) <= POOR
-
-
-def find_zero(problem: Problem, refined: Refined, more: Sequence[Parameter]) -> list[Diagnosis]:
-    """Compare predictions with parameters that are 0 in the model, and were not searched, and without.
-
-    They come as one cause, that of the parameter which explains most.
-    """
-    wide = fit_wider(problem, more)
-    gained = None if wide is None else gain_of(wide, refined)
-    if wide is None or gained is None:
-        return []
-    sure = wide.significance()
-    order = [k for k in np.argsort(-sure) if sure[k] > SURE]
-    if not order:
-        return []
-    named = [more[k] for k in order]
-    values = listed([f"{p.name} = {wide.found[k]:.2g} {p.unit}" for p, k in zip(named, order, strict=True)])
-    seen = (
-        f"With {values} the model predicts motion that it was not fitted to with chi2 "
-        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}."
-    )
-    alarm = Finding.alarm(
-        seen,
-        "In your model this is 0, so it was not searched. Other values compensate for it.",
-        "Write a value above 0 into the MJCF, such as this one, and calibrate again. Or give it a nominal "
-        "value and a range in a parameter file (--parameters).",
-    )
-    joints = tuple(dict.fromkeys(joint for p in named for joint in p.elements))
-    cause = ZERO_CAUSES[named[0].kind]
-    return [Diagnosis.of(cause, gained.share, gained.deviance, joints, alarm, wide.shift_of(refined))]
 
 
 def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:

@@ -25,6 +25,8 @@ from deal_hw.calib.validation.explanations import (
     LAG,
     PLAY,
     SHAPES,
+    ZERO_CAUSES,
+    ZEROS,
     Explanation,
     off_value,
     one_sided,
@@ -131,12 +133,13 @@ def try_explanations(
     allows: Allows,
     given: Sequence[Tried] = (),
     known: Callable[[], Evidence] | None = None,
+    say: Callable[[str], None] = lambda name: None,
 ) -> tuple[Tried, ...]:
     """Screen all explanations of a fit's residual, and fit those that promise most.
 
     Play is always fitted: its effect around a fit without it says little, as nothing moves within it. So is a
     lag: its linearised effect is that of a delay, which the fit has. Around a poor fit the effect says little
-    of all of them, so only play is fitted then.
+    of all of them, so only play is fitted then, and what is 0 in the model: the simplest reason.
 
     Args:
         problem: The problem.
@@ -144,19 +147,22 @@ def try_explanations(
         allows: Which fits may be made.
         given: Earlier results; those of the same problem are kept.
         known: Returns the evidence on the fit, where somebody else needs it, too.
+        say: Called with the name of each explanation that is fitted.
     """
     if any(one.of is problem for one in given):
         return tuple(one for one in given if one.of is problem)
     can = applicable(problem)
     if refined.chi2 > FAR:
-        can = {each: more for each, more in can.items() if each is PLAY}
-        gains, enough = {PLAY: 0.0}, np.inf
+        can = {each: more for each, more in can.items() if each in (*ZEROS, PLAY)}
+        gains, enough = dict.fromkeys(can, 0.0), -np.inf
     elif can:
         gains, enough = _gains(problem, refined, can, known)
     found = []
     for each, more in can.items():
         fitted = each in (PLAY, LAG) or gains[each] > enough
         fitted = fitted and allows(each.name, wider_cost(problem, True, len(more)))
+        if fitted:
+            say(each.name)
         found.append(Tried(each, problem, gains[each], fit_wider(problem, more) if fitted else None))
     return tuple(found)
 
@@ -272,7 +278,8 @@ def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | 
         f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: {of.cause}."
     )
     alarm = Finding.alarm(seen, of.means, of.do.replace("{}", listed(elements)))
-    cause = Diagnosis.of(of.cause, gained.share, gained.deviance, elements, alarm, wide.shift_of(refined))
+    kind = ZERO_CAUSES.get(named[0].kind, of.cause)
+    cause = Diagnosis.of(kind, gained.share, gained.deviance, elements, alarm, wide.shift_of(refined))
     theta = np.concatenate([wide.fit.theta[: len(problem.space)], wide.found[order]])
     return Explained(
         of, cause, problem.with_more(named), theta, wide.fit.latency_s, wide.prediction.chi2, gained.before

@@ -6,7 +6,7 @@ Each candidate is a model with more parameters. It is fitted to a part of the re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.validation.signatures import Cause
-from deal_hw.calib.validation.wider_models import MOST_FORCE, motion
+from deal_hw.calib.validation.wider_models import MOST_FORCE, motion, zero_parameters
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters import KIND_TABLE
@@ -75,6 +75,28 @@ class Explanation:
     means: str
     do: str
     taken: str
+
+
+def _friction(problem: Problem) -> list[Parameter]:
+    return _at_zero(problem, "dof_frictionloss")
+
+
+def _damping(problem: Problem) -> list[Parameter]:
+    return _at_zero(problem, "dof_damping")
+
+
+def _rotor(problem: Problem) -> list[Parameter]:
+    return _at_zero(problem, "dof_armature")
+
+
+def _at_zero(problem: Problem, kind: str) -> list[Parameter]:
+    return [p for p in zero_parameters(problem) if p.kind == kind]
+
+
+def _together(problem: Problem) -> list[Parameter]:
+    """Return all quantities that are 0, where they are of several kinds."""
+    found = zero_parameters(problem)
+    return found if len({p.kind for p in found}) > 1 else []
 
 
 def _play(problem: Problem) -> list[Parameter]:
@@ -202,6 +224,30 @@ def _scale(problem: Problem) -> list[Parameter]:
     ]
 
 
+_NOT_SEARCHED = "In your model this is 0, so it was not searched. Other values compensate for it."
+_WRITE = (
+    "Write values above 0 into the MJCF at {}, such as these, and calibrate again. Or give them nominal "
+    "values and ranges in a parameter file (--parameters)."
+)
+_TAKE = "Use this result: it has them as {}, and so has its MJCF."
+
+ZEROS: Sequence[Explanation] = (
+    Explanation("dry friction that is 0 in the model", "friction", _friction, _NOT_SEARCHED, _WRITE, _TAKE),
+    Explanation("damping that is 0 in the model", "damping", _damping, _NOT_SEARCHED, _WRITE, _TAKE),
+    Explanation("a rotor's inertia that is 0 in the model", "inertia", _rotor, _NOT_SEARCHED, _WRITE, _TAKE),
+    Explanation(
+        "several quantities that are 0 in the model", "inertia", _together, _NOT_SEARCHED, _WRITE, _TAKE
+    ),
+)
+"""Quantities that an MJCF can say, and this one does not: a model made from a URDF often has none of them."""
+
+ZERO_CAUSES: Mapping[str, Cause] = {
+    "dof_armature": "inertia",
+    "dof_frictionloss": "friction",
+    "dof_damping": "damping",
+}
+"""Cause that a parameter stands for which is 0 in the model."""
+
 PLAY = Explanation(
     "play in the gears",
     "backlash",
@@ -222,6 +268,7 @@ LAG = Explanation(
 )
 
 EXPLANATIONS: Sequence[Explanation] = (
+    *ZEROS,
     PLAY,
     Explanation(
         "friction that falls with speed",

@@ -22,6 +22,9 @@ Fault = Literal[
     "zeros",
     "jitter",
     "mass",
+    "no-friction",
+    "no-rotor",
+    "bare",
     "sign",
 ]
 RightModel = Literal["encoders"]
@@ -45,6 +48,9 @@ FAULTS: Mapping[Fault, str] = {
     "zeros": "the zeros of the encoders are others in each recording",
     "jitter": "the delay of each command is between none and twice the mean",
     "mass": "the last link weighs 50 % more than in the model",
+    "no-friction": "the model has no dry friction, as one made from a URDF",
+    "no-rotor": "the model has no inertia of rotors",
+    "bare": "the model has no dry friction, no damping and no inertia of rotors",
     "sign": "the last servo turns the other way",
 }
 """Faults by name, with their descriptions."""
@@ -65,6 +71,13 @@ WITH_STEPS = ("free-speed",)
 
 TURNING = ("free-speed", "friction-rise")
 """Faults of drives that turn: their sizes are in radians."""
+
+WITHOUT: Mapping[str, tuple[str, ...]] = {
+    "no-friction": ("frictionloss",),
+    "no-rotor": ("armature",),
+    "bare": ("frictionloss", "damping", "armature"),
+}
+"""Attributes of joints that a model has as 0, where that is the fault."""
 
 SHARED: Mapping[SharedFault, tuple[str, ...]] = {
     "mirrored": (
@@ -104,6 +117,9 @@ LAWS: Mapping[Fault, tuple[str, ...]] = {
     "motor-dead-zone": ("motors with a dead zone",),
     "motor-asymmetry": ("motors that do more to one side",),
     "encoder-scale": ("encoders with another scale",),
+    "no-friction": ("dry friction that is 0 in the model",),
+    "no-rotor": ("a rotor's inertia that is 0 in the model",),
+    "bare": ("several quantities that are 0 in the model",),
 }
 """The laws that name the fault where the result has one or an alarm names it: a cause alone does not tell
 them from others. A load comes from outside and is held by the motor, so its two laws are one fault."""

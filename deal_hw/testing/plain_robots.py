@@ -29,6 +29,7 @@ from deal_hw.testing.plain_faults import (
     WITH_ENCODERS,
     WITH_MOTORS,
     WITH_STEPS,
+    WITHOUT,
     Fault,
     RightModel,
     SharedFault,
@@ -167,7 +168,8 @@ def make_robot(kind: str, seed: int, fault: Fault | SharedFault | RightModel | N
                 truth[f"{joint.name}.{'servo_stiffness' if name == 'kp' else name}"] = own[name]
         values[joint.name] = own
     delay_s = made.step_s * int(rng.integers(2, 16))
-    nominal = {j.name: {n: getattr(j, n) for n in SPREAD} for j in made.joints}
+    lacks = WITHOUT.get(fault or "", ())
+    nominal = {j.name: {n: 0.0 if n in lacks else getattr(j, n) for n in SPREAD} for j in made.joints}
     return PlainRobot(
         kind=kind,
         model=_mjcf(

@@ -24,6 +24,7 @@ from deal_hw.testing.plain_faults import (
     NOISE,
     SERVO_DEAD_ZONE,
     WITH_MOTORS,
+    WITHOUT,
     Fault,
 )
 from deal_hw.testing.plain_robots import KINDS, PlainRobot, can_have, make_robot, record
@@ -163,6 +164,10 @@ def test_the_model_lacks_the_fault_and_nothing_else(fault: Fault) -> None:
         np.testing.assert_allclose(model.actuator_gear[:, 0], 1.0)
         np.testing.assert_allclose(truth.actuator_gear[:, 0], [robot.truth[f"{name}.gain"] for name in names])
     assert (model.na, truth.na) == (0, truth.nu if fault == "lag" else 0)
+    fields = {"frictionloss": "dof_frictionloss", "damping": "dof_damping", "armature": "dof_armature"}
+    for name, field in fields.items():
+        lacks, values = name in WITHOUT.get(fault, ()), getattr(model, field)
+        assert not values.any() if lacks else values.all()
 
 
 def test_a_fault_that_makes_no_sense_for_a_robot_is_refused() -> None:

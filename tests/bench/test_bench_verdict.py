@@ -15,7 +15,7 @@ from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.errors import UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.testing import plain_effects, plain_faults
-from deal_hw.testing.plain_faults import COUNTS, FAULTS, LAWS, NOISE, WITH_MOTORS, WITH_STEPS
+from deal_hw.testing.plain_faults import COUNTS, FAULTS, LAWS, NOISE, WITH_MOTORS, WITH_STEPS, WITHOUT
 from deal_hw.testing.plain_robots import KINDS, PlainRobot, can_have, make_robot, record, write
 from deal_hw.types import FloatArray
 
@@ -39,7 +39,7 @@ def test_a_robot_is_its_model_with_other_numbers(kind: str) -> None:
     assert any(robot.delay_s == pytest.approx(0.001 * n) for n in range(2, 16))
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault not in WITHOUT])
 def test_each_fault_changes_the_recording_beyond_noise(
     fault: plain_faults.Fault, monkeypatch: pytest.MonkeyPatch
 ) -> None:

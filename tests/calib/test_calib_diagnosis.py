@@ -579,7 +579,10 @@ def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Pa
     fit = with_rows(refine(problem, problem.space.nominal, robot.delay_s, (0.2,), iterations=8))
     assert "pivot.armature" not in problem.space.names and unexplained(fit)
     assert [p.name for p in zero_parameters(problem)] == ["pivot.armature"]
-    (found,) = diagnosis.find_zero(problem, fit, zero_parameters(problem))
+    tried = try_explanations(problem, fit, all_allowed)
+    best = explained(problem, fit, tried)[0]
+    found = best.diagnosis
+    assert best.explanation.name == "a rotor's inertia that is 0 in the model" and best.explains
     value = float(re.findall(r"pivot.armature = (\S+) kg", found.seen)[0])
     assert value == pytest.approx(0.01, rel=0.1)
     assert found.code == "inertia" and found.subject == ("pivot",) and found.share > 0.5

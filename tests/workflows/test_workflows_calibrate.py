@@ -158,8 +158,8 @@ def test_what_the_model_has_as_zero_is_said(pendulum: tuple[Path, Path, Path]) -
     printed: list[str] = []
     searched_space(FilesSettings(model=pendulum[0]), model, printed.append)
     assert printed == [
-        "not searched, because they are 0 in the model: dof_frictionloss of pivot. If the robot has them, "
-        "write values above 0 into the MJCF"
+        "0 in the model: dof_frictionloss of pivot. They are not searched at first, but tried where the "
+        "model explains too little. If the robot has them, write values above 0 into the MJCF"
     ]
 
 

@@ -83,8 +83,8 @@ def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> Paramet
         zero = [f"{kind} of {short(', '.join(names))}" for kind, names in left_at_zero(model).items()]
         if zero:
             say(
-                f"not searched, because they are 0 in the model: {'; '.join(zero)}. If the robot has them, "
-                "write values above 0 into the MJCF"
+                f"0 in the model: {'; '.join(zero)}. They are not searched at first, but tried where the "
+                "model explains too little. If the robot has them, write values above 0 into the MJCF"
             )
         space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
     else:
