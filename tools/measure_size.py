@@ -1,11 +1,15 @@
 """Measure time and memory of a calibration against the size of the robot: arms of 7 and 14 servo joints.
 
     python tools/measure_size.py --joints 7 --limit 600 --out size.json
+    python tools/measure_size.py --joints 14 --lacking --out lacking.json
     python tools/measure_size.py --joints 7 --profile size.prof      # where the time goes, by cProfile
 
 An arm has hidden true values: stiffness, damping, dry friction, armature and encoder bias of every joint, and
 masses of all links but the second. The second is known, because no motion shows the common scale of all
 masses and forces. The base is tilted, so that the first joint carries weight, too. 14 joints are two arms.
+
+With --lacking the model is that of most people: it has no dry friction, and nobody says what to search. So
+masses and encoder biases stay wrong.
 
 The arm is recorded in plain MuJoCo, with late commands and noise. `deal-hw calibrate --model` calibrates it
 in a process of its own with default settings. A row has seconds, peak memory, held-out error, the printed
@@ -15,10 +19,12 @@ row has the best fit until then.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
 import pstats
+import re
 import resource
 import signal
 import subprocess
@@ -50,18 +56,21 @@ SHARES = {"damping": 0.05, "frictionloss": 0.008, "armature": 0.0012}
 """Of the stiffness: damping [s], dry friction [rad], armature [s^2]."""
 FACTORS = {"stiffness": 1.5, "damping": 2.0, "frictionloss": 2.0, "armature": 2.0, "mass": 1.3}
 """Truths lie within these factors of the model's values."""
+UNUSUAL = (".mass", ".encoder_bias")
+"""Ends of the names of parameters that are searched only where somebody asks for them."""
 BIAS_RAD = 0.02
 MOST_LATE_STEPS = 8
 LEAST_HELD_OUT_S = 4.0
 SHOWN_FUNCTIONS = 25
 
 
-def make_arm(joints: int, seed: int) -> tuple[PlainRobot, str]:
+def make_arm(joints: int, seed: int, *, lacking: bool = False) -> tuple[PlainRobot, str]:
     """Return arms of seven joints each with a hidden truth, and the searched parameters (YAML).
 
     Args:
         joints: Joints altogether, a multiple of seven; fewer than seven are the first of an arm.
         seed: Of the truth.
+        lacking: The model has no dry friction, and the usual parameters are searched; the text is empty.
     """
     rng = np.random.default_rng([seed, joints, 40])
     truth: dict[str, float] = {}
@@ -93,7 +102,11 @@ def make_arm(joints: int, seed: int) -> tuple[PlainRobot, str]:
         fault=None,
         seed=seed,
     )
-    return robot, _parameters(list(truth))
+    if not lacking:
+        return robot, _parameters(list(truth))
+    usual = {name: value for name, value in truth.items() if not name.endswith(UNUSUAL)}
+    bare = re.sub(r'frictionloss="[^"]*"', 'frictionloss="0"', robot.model)
+    return dataclasses.replace(robot, model=bare, truth=usual), ""
 
 
 def _draw(rng: np.random.Generator, side: str, k: int) -> dict[str, dict[str, float]]:
@@ -147,7 +160,9 @@ def _parameters(names: Sequence[str]) -> str:
     return "\n".join(["parameters:", *lines]) + "\n"
 
 
-def write_arm(folder: Path, joints: int, seed: int, seconds: float) -> tuple[PlainRobot, list[str]]:
+def write_arm(
+    folder: Path, joints: int, seed: int, seconds: float, *, lacking: bool = False
+) -> tuple[PlainRobot, list[str]]:
     """Write model, parameters and recordings; return the robot and the arguments of ``deal-hw calibrate``.
 
     Args:
@@ -155,20 +170,31 @@ def write_arm(folder: Path, joints: int, seed: int, seconds: float) -> tuple[Pla
         joints: Joints of the robot.
         seed: Of truth, motions and noise.
         seconds: Length of what is fitted, in two recordings; a third recording only judges [s].
+        lacking: As for :func:`make_arm`.
     """
-    robot, parameters = make_arm(joints, seed)
+    robot, parameters = make_arm(joints, seed, lacking=lacking)
     (folder / "robot.xml").write_text(robot.model, encoding="utf-8")
-    (folder / "params.yaml").write_text(parameters, encoding="utf-8")
+    searched = []
+    if parameters:
+        (folder / "params.yaml").write_text(parameters, encoding="utf-8")
+        searched = ["--parameters", "params.yaml"]
     lengths = {"fit1": seconds / 2, "fit2": seconds / 2, "held-out": max(seconds / 6, LEAST_HELD_OUT_S)}
     for number, (name, length_s) in enumerate(lengths.items()):
         text = record(robot, number, round(length_s * RATE_HZ) / RATE_HZ)
         (folder / f"{name}.csv").write_text(text, encoding="utf-8")
-    reported = "--model robot.xml --parameters params.yaml --data fit1.csv fit2.csv --holdout held-out.csv"
-    return robot, ["calibrate", *reported.split(), "--heldout-window", "2", "--out", "out"]
+    files = "--model robot.xml --data fit1.csv fit2.csv --holdout held-out.csv"
+    return robot, ["calibrate", *files.split(), *searched, "--heldout-window", "2", "--out", "out"]
 
 
 def measure(
-    joints: int, seed: int, seconds: float, limit_s: float, more: Sequence[str], profile: Path | None
+    joints: int,
+    seed: int,
+    seconds: float,
+    limit_s: float,
+    more: Sequence[str],
+    profile: Path | None,
+    *,
+    lacking: bool = False,
 ) -> dict[str, Any]:
     """Make an arm, calibrate it and return the row.
 
@@ -179,14 +205,16 @@ def measure(
         limit_s: The calibration is stopped then, as by Ctrl-C [s].
         more: More options of `deal-hw calibrate`.
         profile: File for cProfile's figures; None: no profiling.
+        lacking: As for :func:`make_arm`.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        robot, arguments = write_arm(folder, joints, seed, seconds)
+        robot, arguments = write_arm(folder, joints, seed, seconds, lacking=lacking)
         row: dict[str, Any] = {
             "bench": "size",
             "joints": joints,
             "parameters": len(robot.truth),
+            "lacking": lacking,
             "seed": seed,
             "fitted_s": seconds,
             "limit_s": limit_s,
@@ -244,7 +272,7 @@ def _run(command: Sequence[str], folder: Path, limit_s: float) -> dict[str, Any]
 
 def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
     """Return held-out errors, and errors of estimates and intervals."""
-    rows = {name: result["parameters"][name] for name in robot.truth}
+    rows = {name: result["parameters"][name] for name in robot.truth if name in result["parameters"]}
     reported = {name: row for name, row in rows.items() if row["verdict"] != "not identifiable"}
     ratios = [
         abs(math.log(row["estimate"] / robot.truth[name]))
@@ -254,6 +282,7 @@ def against_truth(robot: PlainRobot, result: dict[str, Any]) -> dict[str, Any]:
     held = [row["low"] <= robot.truth[name] <= row["high"] for name, row in reported.items()]
     rmse = result["provenance"].get("heldout_rmse", {}).get("mean", {})
     return {
+        "laws": [law["law"] for law in result["provenance"].get("laws", ())],
         "method": result["method"],
         "search": result["provenance"].get("search", ""),
         "chi2": result["chi2"],
@@ -290,7 +319,7 @@ def words(row: dict[str, Any]) -> str:
         text += "; held-out error over the range " + ", ".join(shares)
     if row.get("told"):
         text += (
-            f"; {row['reported']} parameters have a value, 100 mean |ln| {row['log_error_x100']:.1f}, "
+            f"; {row['told']} parameters have a value, 100 mean |ln| {row['log_error_x100']:.1f}, "
             f"90 % intervals hold {100 * row['coverage90']:.0f} %"
         )
     return "\n".join([text, *(f"  {line}" for line in row["said"])])
@@ -301,6 +330,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.add_argument("--joints", type=int, nargs="+", default=[7, 14], choices=range(1, 15), metavar="N")
     options.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="SEED")
     options.add_argument("--seconds", type=float, default=60.0, help="length of what is fitted [s]")
+    options.add_argument("--lacking", action="store_true", help="a model without dry friction, wrong masses")
     options.add_argument("--limit", type=float, default=1200.0, help="stop a calibration after this time [s]")
     options.add_argument("--options", default="", help="more options of deal-hw calibrate, in one word")
     options.add_argument("--profile", type=Path, help="file for cProfile's figures; the last run's are kept")
@@ -310,7 +340,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = Rows(__file__, given.out)
     for joints in given.joints:
         for seed in given.seeds:
-            row = measure(joints, seed, given.seconds, given.limit, given.options.split(), given.profile)
+            more = given.options.split()
+            row = measure(
+                joints, seed, given.seconds, given.limit, more, given.profile, lacking=given.lacking
+            )
             rows.add(row, words(row))
     if given.profile is not None and given.profile.exists():
         figures = pstats.Stats(str(given.profile))

@@ -54,6 +54,19 @@ def test_what_is_hidden_is_in_the_robot() -> None:
     assert truth.body("l3_link").mass[0] == pytest.approx(robot.truth["l3_link.mass"])
 
 
+def test_a_model_may_lack_what_the_robot_has(tmp_path: Path) -> None:
+    """The same robot behind a model without dry friction; masses and biases are of nobody's interest."""
+    whole, (robot, text) = make_arm(7, 0)[0], make_arm(7, 0, lacking=True)
+    assert robot.robot == whole.robot and not text
+    model, own = (mujoco.MjModel.from_xml_string(of.model) for of in (robot, whole))
+    assert not model.dof_frictionloss.any() and own.dof_frictionloss.all()
+    np.testing.assert_array_equal(model.dof_damping, own.dof_damping)
+    kinds = {name.split(".")[1] for name in robot.truth}
+    assert kinds == {"servo_stiffness", "damping", "frictionloss", "armature"} and len(robot.truth) == 28
+    _, arguments = write_arm(tmp_path, 7, 0, 6.0, lacking=True)
+    assert "--parameters" not in arguments and (tmp_path / "robot.xml").read_text() == robot.model
+
+
 def test_recordings_have_the_length_that_is_asked_for(tmp_path: Path) -> None:
     """6 s are two recordings of 3 s at 200 Hz; what judges has at least 4 s."""
     write_arm(tmp_path, 1, 0, 6.0)
