@@ -9,7 +9,8 @@ FOLDER has a folder of each robot, as the converters write them from the public 
                      chirp_sweep and friction_gravity
     go2              convert_go2_suspended.py --parts 4 --seconds 12.92; holds out the last part. go2-first:
                      the first one
-    cartpole         convert_cartpole.py, six recordings v1_*; holds out v1_800 and v1_1700
+    cartpole         convert_cartpole.py, six recordings v1_*; holds out v1_800 and v1_1700. cartpole-bare:
+                     the same without the rotor's inertia in the MJCF, as the rig's own files are
     double_pendulum  the CSV files of docs/results/example-double-pendulum.md; holds out 02, 04 and 06
     bam_xl330        convert_bam.py; fits the P gains 100, 200 and 800, holds out 400
     ur10e            convert_ur10e.py; fits motions of 5 and 6 February, holds out one of 10 February, and
@@ -31,6 +32,7 @@ joints: in rad (cart-pole: m and rad), and as a share of the signal's range.
 
 from __future__ import annotations
 
+import re
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -84,11 +86,15 @@ UR10E_HELD_OUT = ("ur-20_02_10-20sec_7harm", "ur-20_01_17-ptp_10_points")
 XL330_MOTIONS = ("sin_sin", "sin_time_square", "up_and_down")
 
 
-def cartpole(folder: Path, made: Path) -> FilesSettings:
-    """Return the inputs of the cart-pole; the rotor's inertia is in its MJCF."""
-    del made
+def cartpole(folder: Path, made: Path, *, rotor: bool = True) -> FilesSettings:
+    """Return the inputs of the cart-pole; the rotor's inertia is in its MJCF, or in none."""
+    model = folder / "cartpole.xml"
+    if not rotor:
+        bare = re.sub(r' armature="[^"]*"', "", model.read_text(encoding="utf-8"))
+        model = made / "cartpole.xml"
+        model.write_text(bare, encoding="utf-8")
     return FilesSettings(
-        model=folder / "cartpole.xml",
+        model=model,
         data=_npz(folder, ["v1_0", "v1_1", "v1_5", "v1_1200"]),
         holdout=_npz(folder, ["v1_800", "v1_1700"]),
         columns=folder / "columns.yaml",
@@ -152,6 +158,7 @@ ROBOTS: Mapping[str, Robot] = {
     "go2": Robot(go2_inputs, 2.5, 2.0, "go2"),
     "go2-first": Robot(partial(go2_inputs, held_out=1), 2.5, 2.0, "go2"),
     "cartpole": Robot(cartpole, 0.2, 0.2, "cartpole"),
+    "cartpole-bare": Robot(partial(cartpole, rotor=False), 0.2, 0.2, "cartpole"),
     "double_pendulum": Robot(double_pendulum, 0.2, 0.2, "double_pendulum"),
     "bam_xl330": Robot(bam_xl330, 1.0, 1.0, "bam_xl330"),
     "ur10e": Robot(ur10e, 0.3, 0.3, "ur10e"),
@@ -178,24 +185,24 @@ def score(robot: Robot, folder: Path, method: str, seed: int) -> Row:
     with tempfile.TemporaryDirectory() as made:
         config = robot.inputs(folder / robot.folder, Path(made))
         work = calibration_input(config)
-    began, cpu = time.monotonic(), time.process_time()
-    space, theta, latency_s, more = fitted(robot, config, work, method, seed)
-    row = {"seconds": time.monotonic() - began, "processor_seconds": time.process_time() - cpu}
-    held_out = HeldOut(work.robot, work.space, work.holdout, robot.window_s, threads=1).of(space)
-    errors = held_out.errors({"fit": (theta, latency_s)})
-    return row | {
-        "parameters": len(space),
-        "fitted_s": float(sum(len(e.sample) * e.period_s for e in work.episodes)),
-        "window_s": robot.window_s,
-        "rmse": errors.mean()["fit"],
-        "rmse_null": errors.mean()["null"],
-        "share": errors.nrmse["fit"],
-        "by_joint": dict(zip(errors.names, map(float, errors.rmse["fit"]), strict=True)),
-        "latency_s": latency_s,
-        "at_bound": names_at_bound(space, theta),
-        "estimate": dict(zip(space.names, map(float, theta), strict=True)),
-        **more,
-    }
+        began, cpu = time.monotonic(), time.process_time()
+        space, theta, latency_s, more = fitted(robot, config, work, method, seed)
+        row = {"seconds": time.monotonic() - began, "processor_seconds": time.process_time() - cpu}
+        held_out = HeldOut(work.robot, work.space, work.holdout, robot.window_s, threads=1).of(space)
+        errors = held_out.errors({"fit": (theta, latency_s)})
+        return row | {
+            "parameters": len(space),
+            "fitted_s": float(sum(len(e.sample) * e.period_s for e in work.episodes)),
+            "window_s": robot.window_s,
+            "rmse": errors.mean()["fit"],
+            "rmse_null": errors.mean()["null"],
+            "share": errors.nrmse["fit"],
+            "by_joint": dict(zip(errors.names, map(float, errors.rmse["fit"]), strict=True)),
+            "latency_s": latency_s,
+            "at_bound": names_at_bound(space, theta),
+            "estimate": dict(zip(space.names, map(float, theta), strict=True)),
+            **more,
+        }
 
 
 def fitted(

@@ -89,6 +89,7 @@ def test_no_recording_is_both_fitted_and_held_out(name: str, tmp_path: Path) -> 
     for number in range(7):
         (tmp_path / f"trajectory_{number:02}.csv").touch()
     (tmp_path / "columns.yaml").touch()
+    (tmp_path / "cartpole.xml").write_text('<joint name="cart" armature="1.4"/>')
     made = tmp_path / "made"
     made.mkdir()
     config = score_real.ROBOTS[name].inputs(tmp_path, made)
@@ -96,3 +97,4 @@ def test_no_recording_is_both_fitted_and_held_out(name: str, tmp_path: Path) -> 
     assert held_out
     assert not set(held_out) & set(config.data)
     assert all(path.exists() for path in (*config.data, *held_out))
+    assert name != "cartpole-bare" or Path(config.model).read_text() == '<joint name="cart"/>'
