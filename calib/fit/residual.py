@@ -19,6 +19,7 @@ simplified derivative of Kaufman (1975).
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -79,6 +80,29 @@ class Point:
     value: FloatArray
     position: tuple[FloatArray, ...]
     velocity: tuple[FloatArray, ...]
+
+
+class _Kept:
+    """Predictions at the last points, for all fits of the same windows.
+
+    Of two points, as a step that is refused leads back to the one before it.
+    """
+
+    def __init__(self) -> None:
+        self._last: collections.deque[tuple[Point, list[FloatArray]]] = collections.deque(maxlen=2)
+
+    def at(self, point: Point) -> list[FloatArray] | None:
+        """Return the predictions at a point, (W, H, M) an episode, if they are known."""
+        starts = (*point.position, *point.velocity)
+        for other, found in self._last:
+            same = all(a is b for a, b in zip(starts, (*other.position, *other.velocity), strict=True))
+            if same and np.array_equal(point.value, other.value):
+                return found
+        return None
+
+    def keep(self, point: Point, found: list[FloatArray]) -> None:
+        """Keep predictions at a point."""
+        self._last.append((point, found))
 
 
 @dataclass(frozen=True)
@@ -161,6 +185,7 @@ class Shooting:
         given: bool = False,
         prior_share: float = np.inf,
         fixed_latency: bool | None = None,
+        kept: _Kept | None = None,
     ) -> None:
         self.problem = problem
         self.fixed_latency = problem.fixed_latency_s is not None if fixed_latency is None else fixed_latency
@@ -178,8 +203,7 @@ class Shooting:
             for d, own in zip(self.data, joined, strict=True)
         ]
         self._moved_with = problem.channel_coordinates
-        # The last point whose predictions are known, and these: (W, H, M) an episode.
-        self._known: tuple[Point | None, list[FloatArray]] = (None, [])
+        self._kept = kept or _Kept()
         space = problem.space
         mean, std = space.prior
         own, around = 1 / std**2, 1 / (prior_share * space.width) ** 2
@@ -222,8 +246,17 @@ class Shooting:
         """Return the same fit of other windows, such as a part of these, or weighted ones."""
         share = self.prior_share if prior_share is None else prior_share
         fixed = self.fixed_latency if fixed_latency is None else fixed_latency
+        pairs = zip(data, self.data, strict=False)
+        # Weights change no prediction.
+        same = len(data) == len(self.data) and all(a.windows is b.windows for a, b in pairs)
         return Shooting(
-            self.problem, self.length, data, given=self.given, prior_share=share, fixed_latency=fixed
+            self.problem,
+            self.length,
+            data,
+            given=self.given,
+            prior_share=share,
+            fixed_latency=fixed,
+            kept=self._kept if same else None,
         )
 
     def start(self, theta: FloatArray, latency_s: float, states: States | None = None) -> Point:
@@ -384,7 +417,7 @@ class Shooting:
             velocity.append(v[best, window])
             observed.append(predicted[best, window])
         found = Point(value, tuple(position), tuple(velocity))
-        self._known = found, observed
+        self._kept.keep(found, observed)
         return found
 
     def vector(self, point: Point) -> FloatArray:
@@ -443,12 +476,13 @@ class Shooting:
         return [data.whitened(y - data.measured) for y, data in zip(predicted, self.data, strict=True)]
 
     def _observed(self, point: Point) -> list[FloatArray]:
-        """Return the predictions at a point, (W, H, M) an episode; those of the last point are kept."""
-        if self._known[0] is not point:
+        """Return the predictions at a point, (W, H, M) an episode; those of the last points are kept."""
+        found = self._kept.at(point)
+        if found is None:
             starts = zip(self.data, point.position, point.velocity, strict=True)
             found = [self._predict(point.value[None], d, x[None], v[None]).observed[0] for d, x, v in starts]
-            self._known = point, found
-        return self._known[1]
+            self._kept.keep(point, found)
+        return found
 
     def perturbed(self, point: Point, spread: float, count: int, rng: np.random.Generator) -> Point:
         """Return the point with, window by window, the best of ``count`` drawn start states.
