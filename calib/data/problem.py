@@ -52,8 +52,10 @@ SLOWEST_JITTER_S = 0.01
 """Longest sampling period at which jitter of the sample times can be separated from the motion [s]."""
 
 VELOCITY_PRIOR_STD: Mapping[str, float] = {"m": 3.0, "rad": 30.0}
-"""Weak prior on start velocities by the coordinate's unit [m/s and rad/s]; keeps windows of few samples
-solvable."""
+"""Weak prior on start velocities [m/s and rad/s]; keeps windows of few samples solvable."""
+
+TOGETHER = 64
+"""Members that are simulated together where laws act between the steps, by copies for several windows."""
 
 UNSEEN_STD = 1e-6
 """Prior on an unmeasured place of the base on the floor [m]; no trajectory depends on it."""
@@ -557,6 +559,12 @@ class Problem:
         batch = self.batch(len(theta), data.episode)
         batch.set_parameters(theta)
         path = setpoints(batch, self.episodes[data.episode], np.maximum(latency_s, 0.0))
+        # Few members leave threads without work, and array code between the steps costs as much for one.
+        most = max(self._batches.threads, TOGETHER if batch.stepwise else 1)
+        copies = min(most // len(theta), len(data.windows)) if self.robot.base is None else 1
+        if copies > 1:
+            batch = self.batch(copies * len(theta), data.episode)
+            batch.set_parameters(np.tile(theta, (copies, 1)))
         return self.predict_along(batch, path, data, position, velocity)
 
     def predict_along(
@@ -572,7 +580,7 @@ class Problem:
 
         ``force`` acts on the coordinates in each device period, (N, W, H * stride, C).
         """
-        shape = batch.count, len(data.windows), data.windows.length, len(self.efforts)
+        shape = len(path), len(data.windows), data.windows.length, len(self.efforts)
         effort = np.empty(shape) if self.efforts else None
         x, v = predict_windows(
             batch,

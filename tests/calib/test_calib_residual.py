@@ -13,6 +13,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import at_parameters, refine, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.validation.explanations import EXPLANATIONS
 from deal_hw.calib.validation.time_steps import scan_latency
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
@@ -99,6 +100,27 @@ def test_a_window_may_start_where_the_one_before_it_ends(small_problem: Callable
         for found, start, expected in zip((x, v), own[e], through[e], strict=True):
             np.testing.assert_allclose(found[first + 20], expected[first + 20], rtol=1e-9)
             assert not np.array_equal(found[first + 20], start[first + 20])
+
+
+@pytest.mark.parametrize("law", ["friction that falls with speed", "drives that lag"])
+def test_windows_that_are_simulated_together_are_predicted_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, law: str
+) -> None:
+    """Laws act by array code between the steps: with several windows at once it runs a fraction as often."""
+    model, paths, _ = write(make_robot("arm", 3), tmp_path, seconds=3.0)
+    work = calibration_input(FilesSettings(model=model, data=paths, threads=1))
+    plain = Problem(work.robot, work.space, work.episodes, threads=1)
+    more = next(each for each in EXPLANATIONS if each.name == law).parameters(plain)
+    found = []
+    for together in (1, 64):
+        monkeypatch.setattr("deal_hw.calib.data.problem.TOGETHER", together)
+        wide = plain.with_more(more)
+        shooting = Shooting(wide, 20)
+        before = wide.steps
+        normal = shooting.normal(shooting.start(wide.space.nominal, 0.004))
+        found.append((normal.hessian, normal.gradient, wide.steps - before))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 TWO = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>

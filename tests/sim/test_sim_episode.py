@@ -11,7 +11,7 @@ from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import InsufficientDataError
 from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig, Segment
-from deal_hw.sim.engine.batch import ServoBatch
+from deal_hw.sim.engine.batch import ServoBatch, StepCount
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import SampledEpisode, align, fill_gaps
 from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
@@ -43,6 +43,29 @@ def without(t: Trajectory, first: int, stop: int) -> Trajectory:
         "command_age_s",
     )
     return dataclasses.replace(t, **{name: getattr(t, name)[keep] for name in fields})
+
+
+@pytest.mark.parametrize("copies", [2, 4, 50])
+def test_copies_of_the_members_simulate_windows_at_once(recorded: VirtualEpisode, copies: int) -> None:
+    """To the last bit, with forces, through changes of gains and limits; idle copies count no step."""
+    robot, space = load_model(DESCRIPTION), k9_space()
+    episode = align(recorded.trajectory, DESCRIPTION)
+    windows = cut_windows(episode, 20)
+    rng, shape = np.random.default_rng(0), (2, len(windows), 20 * windows.stride, 2)
+    theta = np.stack([space.nominal, 1.1 * space.nominal]).clip(space.low, space.high)
+    x = episode.position[windows.start] + 0.01 * rng.standard_normal((2, len(windows), 2))
+    v, force = episode.velocity[windows.start], rng.standard_normal(shape)
+    found, steps = [], []
+    for count in (2, 2 * copies):
+        counted = StepCount()
+        batch = ServoBatch(robot, space, count, threads=1, counted=counted)
+        batch.set_parameters(np.tile(theta, (count // 2, 1)))
+        path = setpoints(batch, episode, np.tile([0.011, 0.013], count // 2))[:2]
+        found.append(predict_windows(batch, episode, windows, x, v, path, force))
+        steps.append(counted.steps)
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+    assert steps[0] == steps[1] > 0
 
 
 def test_simulation_explains_the_recording_to_the_wire_resolution(recorded: VirtualEpisode) -> None:

@@ -454,6 +454,15 @@ class ServoBatch:
             self.effort[bad] = np.nan
         return position, velocity
 
+    def discount(self, steps: int) -> None:
+        """Take physics steps whose result nobody uses from the count."""
+        self._counted.steps -= steps
+
+    @property
+    def stepwise(self) -> bool:
+        """Whether laws act between the physics steps, by array code."""
+        return self._steps is not None
+
     @property
     def recorded(self) -> tuple[str, ...]:
         """Fields of MjData that a rollout records."""
@@ -510,7 +519,7 @@ class BatchPool:
         counted: StepCount | None = None,
     ) -> None:
         self._robot, self._space, self._most = robot, space, most
-        self._threads = threads or default_threads()
+        self.threads = threads or default_threads()
         self._kept: dict[tuple[int, int, str, EngineName], list[ServoBatch]] = {}
         self._most *= 1 + len(robot.setups)
         self.counted = counted or StepCount()
@@ -520,7 +529,7 @@ class BatchPool:
 
     def __reduce__(self) -> tuple[type[BatchPool], tuple[RobotModel, ParameterSpace, int]]:
         """Pickle without the simulators, which cannot be, and with a count of steps of its own."""
-        return BatchPool, (self._robot, self._space, self._threads)
+        return BatchPool, (self._robot, self._space, self.threads)
 
     @property
     def steps(self) -> int:
@@ -544,12 +553,12 @@ class BatchPool:
         So the work between two steps of a closed loop is divided among the threads, too. The result does not
         depend on their number.
         """
-        return self._take(count, min(self._threads, count), setup, "mujoco")
+        return self._take(count, min(self.threads, count), setup, "mujoco")
 
     def _take(self, count: int, parts: int, setup: str, engine: EngineName) -> list[ServoBatch]:
         key, robot = (count, parts, setup, engine), self._robot.in_setup(setup)
         sizes = [count // parts + (i < count % parts) for i in range(parts)]
-        threads = max(self._threads // parts, 1)
+        threads = max(self.threads // parts, 1)
         kept = self._kept.pop(key, None) or [
             ServoBatch(robot, self._space, n, threads, self.counted, engine) for n in sizes
         ]

@@ -154,7 +154,8 @@ def predict_windows(
     """Predict all windows with all members.
 
     Args:
-        batch: The members, parameters set.
+        batch: The members, parameters set. With copies of all of them, which follow, as many windows are
+            simulated at once.
         episode: The episode.
         windows: The windows.
         position: Positions at the windows' starts, (W, C) or (N, W, C).
@@ -167,6 +168,8 @@ def predict_windows(
         Positions and velocities at the samples after each start, (N, W, H, C) each, around each sample's
         reference orientation; NaN where a member diverged.
     """
+    if batch.count > len(setpoint):
+        return _predict_by_copies(batch, episode, windows, position, velocity, setpoint, force, effort)
     if batch.engine.windows > 1:
         return _predict_at_once(batch, episode, windows, position, velocity, setpoint, force, effort)
     N, W, H = batch.count, len(windows), windows.length
@@ -236,6 +239,46 @@ def _predict_at_once(
         )
         if effort is not None:
             effort[:, rows] = batch.effort
+    return out_x, out_v
+
+
+def _predict_by_copies(
+    batch: ServoBatch,
+    episode: SampledEpisode,
+    windows: Windows,
+    position: FloatArray,
+    velocity: FloatArray,
+    setpoint: FloatArray,
+    force: FloatArray | None,
+    effort: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict as :func:`predict_windows`, each window by another copy of the members; for a fixed base."""
+    N, W, H = len(setpoint), len(windows), windows.length
+    C = episode.position.shape[1]
+    x, v = np.broadcast_to(position, (N, W, C)), np.broadcast_to(velocity, (N, W, C))
+    out_x, out_v = np.empty((N, W, H, C)), np.empty((N, W, H, C))
+    copies, steps = batch.count // N, H * windows.stride
+    first = episode.sample[windows.start]
+    repeat = round(episode.step_s / batch.robot.step_s)
+
+    def by_copy(values: FloatArray) -> FloatArray:
+        """Return values of windows, (N, copies, ...), as those of all copies."""
+        return np.moveaxis(values, 1, 0).reshape(-1, *values.shape[2:])
+
+    for rows in _groups([_sent(episode, int(at)) for at in first], copies):
+        at = int(first[rows[0]])
+        batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
+        # Copies without a window of their own repeat the last one.
+        used = np.append(rows, np.repeat(rows[-1:], copies - len(rows)))
+        batch.set_state(by_copy(x[:, used]), by_copy(v[:, used]))
+        period = first[used][:, None] + np.arange(steps)
+        control = np.repeat(by_copy(setpoint[:, period]), repeat, axis=1)
+        pushed = None if force is None else np.repeat(by_copy(force[:, used]), repeat, axis=1)
+        found = batch.advance(control, windows.stride * repeat, force=pushed)
+        batch.discount((copies - len(rows)) * N * steps * repeat)
+        for out, values in zip((out_x, out_v, effort), (*found, batch.effort), strict=True):
+            if out is not None:
+                out[:, rows] = np.moveaxis(values.reshape(copies, N, *values.shape[1:])[: len(rows)], 0, 1)
     return out_x, out_v
 
 
