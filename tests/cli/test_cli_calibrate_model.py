@@ -130,7 +130,7 @@ def test_mjcf_and_csv_give_a_report(folder: Path, tmp_path: Path, capsys: pytest
 def test_last_part_is_held_out_and_noise_can_be_said(folder: Path, tmp_path: Path) -> None:
     """Without --holdout the last quarter judges; --residual-std is what residuals are measured by."""
     words = command(folder, "--no-refine", "--no-report", "--quiet", "--residual-std", "0.005")
-    assert main([*words, "--generations", "6", "--out", str(tmp_path)]) == EXIT_OK
+    assert main([*words, "--generations", "10", "--out", str(tmp_path)]) == EXIT_OK
     found = json.loads((tmp_path / "calibration" / "result.json").read_text())
     assert found["provenance"]["fitted_s"] == pytest.approx(4.48, abs=0.03)
     assert found["provenance"]["heldout_s"] == pytest.approx(1.5, abs=0.03)
