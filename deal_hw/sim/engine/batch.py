@@ -46,8 +46,8 @@ COMMAND_KINDS = {
 """Kinds of parameters that are laws of commands, and their fields in `CommandLaws`."""
 
 SIZES_KEPT = 8
-"""Number of simulator sizes that are kept: one iteration of a search or refinement needs up to four, each with
-its copies for several windows."""
+"""Number of simulator sizes that are kept: one iteration of a search or refinement needs up to four, each
+with its copies for several windows."""
 
 
 def _note(warning: str) -> None:
