@@ -189,7 +189,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 local = with_rows(local)
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
-            # Around a poor fit only play would be fitted; see `try_explanations`.
+            # Around a poor fit only play and what is 0 would be fitted; see `try_explanations`.
             later = local is not None and local.chi2 > FAR and self.fits.tries_laws(run)
             if local is not None and self.settings.diagnosis and not later:
                 with run.check(EXPLANATIONS):

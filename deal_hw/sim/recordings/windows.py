@@ -168,9 +168,7 @@ def predict_windows(
         Positions and velocities at the samples after each start, (N, W, H, C) each, around each sample's
         reference orientation; NaN where a member diverged.
     """
-    if batch.count > len(setpoint):
-        return _predict_by_copies(batch, episode, windows, position, velocity, setpoint, force, effort)
-    if batch.engine.windows > 1:
+    if batch.count > len(setpoint) or batch.engine.windows > 1:
         return _predict_at_once(batch, episode, windows, position, velocity, setpoint, force, effort)
     N, W, H = batch.count, len(windows), windows.length
     C = episode.position.shape[1]
@@ -216,70 +214,76 @@ def _predict_at_once(
     force: FloatArray | None,
     effort: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Predict as :func:`predict_windows`, as many windows at once as the engine takes."""
-    N, W, H = batch.count, len(windows), windows.length
-    C = episode.position.shape[1]
-    x, v = np.broadcast_to(position, (N, W, C)), np.broadcast_to(velocity, (N, W, C))
-    out_x, out_v = np.empty((N, W, H, C)), np.empty((N, W, H, C))
-    first = episode.sample[windows.start]
-    period = first[:, None] + np.arange(H * windows.stride)
-    repeat = round(episode.step_s / batch.robot.step_s)
-    for rows in _groups([_sent(episode, int(at)) for at in first], batch.engine.windows):
-        at, starts = int(first[rows[0]]), windows.start[rows]
-        batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
-        pushed = None if force is None else np.repeat(force[:, rows], repeat, axis=2)
-        reference = episode.reference
-        out_x[:, rows], out_v[:, rows] = batch.advance_windows(
-            (x[:, rows], v[:, rows]),
-            np.repeat(setpoint[:, period[rows]], repeat, axis=2),
-            windows.stride * repeat,
-            None if reference is None else reference[starts],
-            None if reference is None else reference[starts[:, None] + 1 + np.arange(H)],
-            pushed,
-        )
-        if effort is not None:
-            effort[:, rows] = batch.effort
-    return out_x, out_v
-
-
-def _predict_by_copies(
-    batch: ServoBatch,
-    episode: SampledEpisode,
-    windows: Windows,
-    position: FloatArray,
-    velocity: FloatArray,
-    setpoint: FloatArray,
-    force: FloatArray | None,
-    effort: FloatArray | None,
-) -> tuple[FloatArray, FloatArray]:
-    """Predict as :func:`predict_windows`, each window by another copy of the members; for a fixed base."""
+    """Predict as :func:`predict_windows`, several windows at once: as the engine takes them, or by copies."""
     N, W, H = len(setpoint), len(windows), windows.length
     C = episode.position.shape[1]
     x, v = np.broadcast_to(position, (N, W, C)), np.broadcast_to(velocity, (N, W, C))
     out_x, out_v = np.empty((N, W, H, C)), np.empty((N, W, H, C))
-    copies, steps = batch.count // N, H * windows.stride
+    copies, reference = batch.count // N, episode.reference
     first = episode.sample[windows.start]
+    period = first[:, None] + np.arange(H * windows.stride)
     repeat = round(episode.step_s / batch.robot.step_s)
+    for rows in _groups([_sent(episode, int(at)) for at in first], max(copies, batch.engine.windows)):
+        at, starts = int(first[rows[0]]), windows.start[rows]
+        batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
+        state = x[:, rows], v[:, rows]
+        control = np.repeat(setpoint[:, period[rows]], repeat, axis=2)
+        pushed = None if force is None else np.repeat(force[:, rows], repeat, axis=2)
+        if copies > 1:
+            found = _advance_copies(batch, state, control, windows.stride * repeat, pushed)
+        else:
+            found = (
+                *batch.advance_windows(
+                    state,
+                    control,
+                    windows.stride * repeat,
+                    None if reference is None else reference[starts],
+                    None if reference is None else reference[starts[:, None] + 1 + np.arange(H)],
+                    pushed,
+                ),
+                batch.effort,
+            )
+        for out, values in zip((out_x, out_v, effort), found, strict=True):
+            if out is not None:
+                out[:, rows] = values
+    return out_x, out_v
+
+
+def _advance_copies(
+    batch: ServoBatch,
+    state: tuple[FloatArray, FloatArray],
+    control: FloatArray,
+    every: int,
+    force: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Simulate each window by another copy of the members; for a fixed base.
+
+    Args:
+        batch: The members and their copies.
+        state: Positions and velocities at the starts of at most as many windows, (N, G, C) each.
+        control: Set-points, (N, G, S, A).
+        every: Steps from one sample to the next.
+        force: Forces on the coordinates, (N, G, S, C); none by default.
+
+    Returns:
+        Positions, velocities and efforts at the samples, (N, G, H, ...) each.
+    """
+    N, G, steps = control.shape[:3]
+    copies = batch.count // N
+    # Copies without a window of their own repeat the last one.
+    used = np.minimum(np.arange(copies), G - 1)
 
     def by_copy(values: FloatArray) -> FloatArray:
-        """Return values of windows, (N, copies, ...), as those of all copies."""
-        return np.moveaxis(values, 1, 0).reshape(-1, *values.shape[2:])
+        return np.moveaxis(values[:, used], 1, 0).reshape(-1, *values.shape[2:])
 
-    for rows in _groups([_sent(episode, int(at)) for at in first], copies):
-        at = int(first[rows[0]])
-        batch.set_sent(episode.stiffness[at], episode.damping[at], episode.effort_limit[at])
-        # Copies without a window of their own repeat the last one.
-        used = np.append(rows, np.repeat(rows[-1:], copies - len(rows)))
-        batch.set_state(by_copy(x[:, used]), by_copy(v[:, used]))
-        period = first[used][:, None] + np.arange(steps)
-        control = np.repeat(by_copy(setpoint[:, period]), repeat, axis=1)
-        pushed = None if force is None else np.repeat(by_copy(force[:, used]), repeat, axis=1)
-        found = batch.advance(control, windows.stride * repeat, force=pushed)
-        batch.discount((copies - len(rows)) * N * steps * repeat)
-        for out, values in zip((out_x, out_v, effort), (*found, batch.effort), strict=True):
-            if out is not None:
-                out[:, rows] = np.moveaxis(values.reshape(copies, N, *values.shape[1:])[: len(rows)], 0, 1)
-    return out_x, out_v
+    batch.set_state(by_copy(state[0]), by_copy(state[1]))
+    x, v = batch.advance(by_copy(control), every, force=None if force is None else by_copy(force))
+    batch.discount((copies - G) * N * steps)
+
+    def by_window(values: FloatArray) -> FloatArray:
+        return np.moveaxis(values.reshape(copies, N, *values.shape[1:])[:G], 0, 1)
+
+    return by_window(x), by_window(v), by_window(batch.effort)
 
 
 def _groups(sent: Sequence[Sent], most: int) -> Iterator[IntArray]:
