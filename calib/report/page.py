@@ -27,7 +27,9 @@ from deal_hw.parameters import Parameter, ParameterDistribution
 from deal_hw.sim.engine.model import RobotModel, at_step
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
 from deal_hw.sim.mjcf.exports import write_exports
+from deal_hw.sim.mjcf.plain import write_plain_mjcf
 from deal_hw.sim.parameters.effort import EFFORT_KINDS
+from deal_hw.sim.plain_model import FACTS, PLAIN_MODEL, difference_words
 
 DISTRIBUTION = "distribution.json"
 MODEL = "calibrated.xml"
@@ -360,6 +362,7 @@ def write_result(
                 require_other(folder / MODEL, robot.description.mjcf)
                 written = write_model(robot, result, waiting / MODEL)
                 names += [file.name for file in written]
+                names += _write_plain(result, waiting)
             except ConfigurationError as err:
                 # An error in the model must not cost the numbers.
                 unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
@@ -397,6 +400,21 @@ def write_model(robot: RobotModel, result: CalibrationResult, path: Path) -> tup
         trust(result).colour,
         result.biased,
     )
+
+
+def _write_plain(result: CalibrationResult, folder: Path) -> list[str]:
+    """Write the calibrated model for MuJoCo alone beside the calibrated one; return its files' names."""
+    facts = result.provenance.get(FACTS, {})
+    if "error" in facts:
+        return []
+    words = difference_words(facts)
+    made = write_plain_mjcf(
+        folder / MODEL,
+        folder / PLAIN_MODEL,
+        bristles=bool(facts.get("bristles")),
+        remarks=[words] if words else [],
+    )
+    return [file.name for file in made.files]
 
 
 def _trace(result: CalibrationResult) -> dict[str, Any]:

@@ -196,9 +196,8 @@ def names(
         return any(word in text for text in sentences for word in SIGN_WORDS)
     if known == "blind-encoder":
         return any(_at_blind_place(kind, text) for text in sentences)
-    if known in LAWS:
-        return any(law in LAWS[known] for law in laws)
-    return any(cause in CAUSES[known] for cause in causes)
+    by_law = any(law in LAWS.get(known, ()) for law in laws)
+    return by_law or any(cause in CAUSES.get(known, ()) for cause in causes)
 
 
 def _at_blind_place(kind: str, text: str) -> bool:

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import tyro
 
 from deal_hw.calibration import Progress, ProgressCallback
-from deal_hw.cli.calibrate_output import print_files, print_lost, print_result, print_verdict, show_progress
+from deal_hw.cli.calibrate_output import (
+    print_files,
+    print_lost,
+    print_plain,
+    print_result,
+    print_verdict,
+    show_progress,
+)
 from deal_hw.cli.json_output import only_document
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, MissingExtraError
@@ -224,6 +231,7 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         print_result(report.result, work.advice, work.name)
         print_files(report.files)
         print_lost(report.result)
+        print_plain(report.result)
         _print_next(report, work.name, results.path.parent)
         print_verdict(report.result)
     return report

@@ -85,6 +85,24 @@ def print_lost(result: CalibrationResult) -> None:
         )
 
 
+def print_plain(result: CalibrationResult) -> None:
+    """Print what the calibrated model for MuJoCo alone has of the laws, if there is one."""
+    from deal_hw.sim.plain_model import FACTS, PLAIN_MODEL, difference_words
+
+    facts = result.provenance.get(FACTS, {})
+    if "error" in facts:
+        print(f"there is no {PLAIN_MODEL}: {facts['error']}")
+        return
+    if not (facts.get("has") or facts.get("lacks")):
+        return
+    has, lacks = ("; ".join(facts[name]) or "none" for name in ("has", "lacks"))
+    words = difference_words(facts)
+    print(
+        f"{PLAIN_MODEL} is the model for MuJoCo without deal-hw. Laws in it: {has}. Not in it: "
+        f"{lacks}.{words and ' ' + words[0].upper() + words[1:] + '.'}"
+    )
+
+
 def print_result(result: CalibrationResult, advice: str, name: str = "") -> None:
     """Print the parameters, what the data do not determine, what to record next, and the held-out error.
 

@@ -25,7 +25,8 @@ from deal_hw.sim.engine.model import command_scale, drop_filters, filters_of
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.transmission import take_constant_torques
 from deal_hw.sim.laws.setpoints import delay, slew
-from deal_hw.sim.mjcf.calibrated import LATENCY_NUMERIC, custom_name
+from deal_hw.sim.mjcf.calibrated import custom_latency_s, custom_name, custom_values
+from deal_hw.sim.mjcf.plain import PLAIN_TEXT
 from deal_hw.sim.parameters import DEVICE_KINDS, KIND_TABLE
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
@@ -48,20 +49,31 @@ class ActuatorLaws:
         data: Its data. Call :meth:`restart` after a reset.
 
     Raises:
-        ConfigurationError: A law names a joint or actuator that the model lacks.
+        ConfigurationError: A law names a joint or actuator that the model lacks, or the model has the laws
+            itself (:mod:`deal_hw.sim.mjcf.plain`).
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
-        values = {kind: found for kind in DEVICE_KINDS if (found := _elements(model, custom_name(kind)))}
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, PLAIN_TEXT) >= 0:
+            raise ConfigurationError(
+                "this model has laws as MuJoCo's own elements, and they would act twice; give the calibrated "
+                "model from which it was made (calibrated.xml), or call mujoco.mj_step"
+            )
+        listed = {kind: custom_values(model, custom_name(kind)) for kind in DEVICE_KINDS}
+        values = {
+            kind: [(name, np.array([value])) for name, value in found.items()]
+            for kind, found in listed.items()
+            if found
+        }
         actuators, joints = element_names(model, "actuator"), element_names(model, "joint")
 
         def of(kind: str, names: list[str], neutral: float) -> FloatArray:
             found = spread(values, kind, names, neutral, 1)
             return np.full(len(names), neutral) if found is None else found[0]
 
-        for kind, found in values.items():
-            for name, _ in found:
+        for kind, elements in values.items():
+            for name, _ in elements:
                 element_id(model, KIND_TABLE[kind].element, name)
         self._joint = [int(j) for j in model.actuator_trnid[:, 0]]
         drives = [find_drive(model, i) for i in range(model.nu)]
@@ -70,7 +82,7 @@ class ActuatorLaws:
         filters = filters_of(model, range(model.nu), self._per_ctrl)
         drop_filters(model)
         self._rate = of("servo_speed_limit", actuators, np.inf) * model.opt.timestep
-        late_s = of(COMMAND_DELAY, actuators, 0.0) + _latency_s(model)
+        late_s = of(COMMAND_DELAY, actuators, 0.0) + custom_latency_s(model)
         self._lag = late_s[None] / model.opt.timestep
         self._commands = command_laws(values, actuators, 1, filters if filters.lag_s.any() else None)
         self._bias, self._scale = of(ENCODER_BIAS, joints, 0.0), of(ENCODER_SCALE, joints, 1.0)
@@ -136,32 +148,3 @@ class ActuatorLaws:
         """Return the command at which servos rest in the model's pose, and motors are off."""
         at = self._data.qpos[self._model.jnt_qposadr[self._joint]]
         return np.where(self._servo, self._scale[self._joint] * at + self._bias[self._joint], 0.0)
-
-
-def _latency_s(model: mujoco.MjModel) -> float:
-    values = _numeric(model, LATENCY_NUMERIC)
-    return values[0] if values else 0.0
-
-
-def _numeric(model: mujoco.MjModel, name: str) -> list[float]:
-    k = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
-    if k < 0:
-        return []
-    values: list[float] = model.numeric(k).data.tolist()
-    return values
-
-
-def _elements(model: mujoco.MjModel, name: str) -> list[tuple[str, FloatArray]]:
-    """Return the elements of a list in ``<custom>`` with their values, (1,); none where there is no list."""
-    values = _numeric(model, name)
-    if not values:
-        return []
-    k = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, f"{name}.elements")
-    text = bytes(model.text_data[model.text_adr[k] :][: model.text_size[k]]) if k >= 0 else b""
-    names = text.rstrip(b"\0").decode().split()
-    if len(names) != len(values):
-        raise ConfigurationError(
-            f"<custom>: {name} has {len(values)} values and {len(names)} elements; write the file again with "
-            "deal-hw calibrate"
-        )
-    return [(name, np.array([value])) for name, value in zip(names, values, strict=True)]

@@ -109,6 +109,7 @@ CAUSES: Mapping[Fault, tuple[str, ...]] = {
 """Causes of the calibration's diagnosis that name the fault."""
 
 LAWS: Mapping[Fault, tuple[str, ...]] = {
+    "friction": ("friction that falls with speed",),
     "load-friction": ("friction that grows with the motor's torque", "friction that grows with load"),
     "friction-rise": ("friction that rises with speed",),
     "lag": ("drives that lag",),
@@ -121,8 +122,11 @@ LAWS: Mapping[Fault, tuple[str, ...]] = {
     "no-rotor": ("a rotor's inertia that is 0 in the model",),
     "bare": ("several quantities that are 0 in the model",),
 }
-"""The laws that name the fault where the result has one or an alarm names it: a cause alone does not tell
-them from others. A load comes from outside and is held by the motor, so its two laws are one fault."""
+"""The laws that name the fault where the result has one or an alarm names it.
+
+A cause alone does not tell them from others, but for friction, whose cause is its own. A load comes from
+outside and is held by the motor, so its two laws are one fault.
+"""
 
 SIGN_WORDS = ("sign", "wrong way", "other way", "against")
 """A refusal or warning with one of these words names a servo that turns the other way."""

@@ -117,8 +117,11 @@ class Calibration:
     def save(self, folder: Path | str) -> dict[str, Path]:
         """Write the files of ``deal-hw calibrate`` except the report; return them by name."""
         from deal_hw.calib.report.page import write_result
+        from deal_hw.workflows.calibration.run import plain_model
 
-        return write_result(Path(folder), self.inputs.robot, self.result)
+        provenance = {**self.result.provenance, **plain_model(self.inputs, self.result)}
+        result = dataclasses.replace(self.result, provenance=provenance)
+        return write_result(Path(folder), self.inputs.robot, result)
 
     def _words(self) -> list[str]:
         from deal_hw.calib.report.verdict import trust

@@ -569,7 +569,7 @@ def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tm
     files = write_result(tmp_path / "a", robot, gathered.result, gathered)
     exports = {"actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"}
     numbers = {"result.json", "distribution.json", "trace.npz"}
-    assert set(files) == {*numbers, *exports, "report.html", "calibrated.xml"}
+    assert set(files) == {*numbers, *exports, "report.html", "calibrated.xml", "plain_mujoco.xml"}
     assert all(file.is_file() for file in files.values())
     digest = gathered.result.distribution().digest()
     assert f"method truth, distribution {digest}" in files["calibrated.xml"].read_text()

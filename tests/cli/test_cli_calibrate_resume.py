@@ -190,7 +190,7 @@ def test_a_worse_fit_does_not_replace_the_best() -> None:
     )
 
 
-FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "report.html"}
+FILES = {"result.json", "distribution.json", "trace.npz", "calibrated.xml", "plain_mujoco.xml", "report.html"}
 FILES |= {"actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"}
 
 

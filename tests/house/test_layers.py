@@ -94,7 +94,13 @@ ROOMS = {
         {"unitree_mujoco"},
     ),
     "data": ({"files", "table"}, {"checks"}, {"recording", "run_folder"}, {"importing"}, {"export"}),
-    "sim": ({"parameters", "laws"}, {"engine"}, {"legged", "mjcf"}, {"recordings", "robots", "actuators"}),
+    "sim": (
+        {"parameters", "laws"},
+        {"engine"},
+        {"legged", "mjcf"},
+        {"recordings", "robots", "actuators"},
+        {"plain_model"},
+    ),
 }
 """Rooms of a package, the lowest first: a room may import rooms of the sets before its own, and itself."""
 

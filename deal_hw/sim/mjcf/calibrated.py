@@ -120,6 +120,39 @@ def _write_lags(model: Any, space: ParameterSpace, theta: FloatArray) -> set[str
     return found
 
 
+def custom_latency_s(model: Any) -> float:
+    """Return the latency in ``<custom>`` [s]; 0 where there is none."""
+    return next(iter(_numeric(model, LATENCY_NUMERIC)), 0.0)
+
+
+def custom_values(model: Any, name: str) -> dict[str, float]:
+    """Return the values of a list in ``<custom>`` by element; none where there is no list.
+
+    Raises:
+        ConfigurationError: It has more values than elements, or fewer.
+    """
+    values = _numeric(model, name)
+    if not values:
+        return {}
+    k = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, f"{name}.elements")
+    text = bytes(model.text_data[model.text_adr[k] :][: model.text_size[k]]) if k >= 0 else b""
+    names = text.rstrip(b"\0").decode().split()
+    if len(names) != len(values):
+        raise ConfigurationError(
+            f"<custom>: {name} has {len(values)} values and {len(names)} elements; write the file again with "
+            "deal-hw calibrate"
+        )
+    return dict(zip(names, values, strict=True))
+
+
+def _numeric(model: Any, name: str) -> list[float]:
+    k = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    if k < 0:
+        return []
+    values: list[float] = model.numeric(k).data.tolist()
+    return values
+
+
 def device_values(
     space: ParameterSpace, theta: FloatArray, filters: Collection[str] = ()
 ) -> dict[str, tuple[list[float], list[str]]]:
@@ -186,7 +219,7 @@ def change_mjcf(
                 file.write_bytes(content.render())
             if not open_:
                 break
-            have = _compile(target)
+            have = compiled(target)
         _check(target, have, want)
     except (ConfigurationError, OSError):
         for file in written:
@@ -205,7 +238,12 @@ def require_other(target: Path, path: Path) -> None:
         raise ConfigurationError(f"{target} is the model itself; write the calibrated one to another file")
 
 
-def _compile(path: Path) -> Any:
+def compiled(path: Path) -> Any:
+    """Return a written model.
+
+    Raises:
+        ConfigurationError: It does not compile.
+    """
     try:
         # MuJoCo finds files of included files differently for absolute and relative paths.
         return mujoco.MjModel.from_xml_path(os.path.abspath(path))

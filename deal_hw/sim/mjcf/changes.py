@@ -123,7 +123,12 @@ class MjcfChanges:
             )
         return bool(masks) or options
 
-    def _find(self, kind: str, index: int) -> Element:
+    def find(self, kind: str, index: int) -> Element:
+        """Return the element of a compiled object.
+
+        Raises:
+            ConfigurationError: It is not in the file's text.
+        """
         element = self._elements[kind][index]
         if element is None:
             raise ConfigurationError(
@@ -151,7 +156,7 @@ class MjcfChanges:
         elif kind == "qpos":
             rows = sorted({int(np.searchsorted(have.jnt_qposadr, row, side="right")) - 1 for row in rows})
         for i in rows:
-            element = self._find(target, i)
+            element = self.find(target, i)
             if element.name == "freejoint":
                 self._unfold_freejoint(i, element, want)
             self._write(target, kind, i, element, attribute, have, want)
@@ -207,7 +212,7 @@ class MjcfChanges:
             compiler.set("settotalmass", None)
             if compiler.get("inertiafromgeom") == "true":
                 compiler.set("inertiafromgeom", "auto")
-        body = self._find("body", i)
+        body = self.find("body", i)
         mass, inertia, pos, quat = (getattr(want, f)[i] for f in tables.INERTIA_FIELDS)
         old = [getattr(have, f)[i] for f in tables.INERTIA_FIELDS]
         element = next((e for e in (*body.inside, *body.spliced()) if e.tag == "inertial"), None)
@@ -237,7 +242,7 @@ class MjcfChanges:
                     element.set("quat", numbers(quat))
 
     def _gains(self, i: int, have: Any, want: Any) -> None:
-        element = self._find("actuator", i)
+        element = self.find("actuator", i)
         gain, bias = want.actuator_gainprm[i], want.actuator_biasprm[i]
         same = all(getattr(have, f)[i] == getattr(want, f)[i] for f in tables.TYPE_FIELDS)
         timed = have.actuator_dynprm[i, 0] != want.actuator_dynprm[i, 0]

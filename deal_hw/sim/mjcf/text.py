@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -94,6 +94,14 @@ class Element:
                 yield from child.spliced()
             else:
                 yield child
+
+
+def new_element(tag: str, inside: Iterable[Element] = (), **attributes: str) -> Element:
+    """Return an element that no file has, with others inside."""
+    element = Element(tag, last=list(inside))
+    for name, value in attributes.items():
+        element.set(name, value)
+    return element
 
 
 @dataclass(slots=True, eq=False)

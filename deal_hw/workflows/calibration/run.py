@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -472,6 +473,15 @@ def finish(
     return CalibrateReport(result=result, files=files)
 
 
+def plain_model(work: CalibrationInput, result: CalibrationResult) -> dict[str, Any]:
+    """Return the provenance of the calibrated model for MuJoCo alone: what it has, and how near it is."""
+    from deal_hw.calib.report.page import write_model
+    from deal_hw.sim.plain_model import FACTS, plain_facts
+
+    episodes = (*work.episodes, *work.holdout)
+    return {FACTS: plain_facts(work.robot, partial(write_model, work.robot, result), episodes)}
+
+
 def judged(
     work: CalibrationInput,
     result: CalibrationResult,
@@ -494,6 +504,7 @@ def judged(
             **result.provenance,
             **work.provenance,
             **settings,
+            **plain_model(work, result),
             "versions": {name: metadata.version(name) for name in names},
             "processors": len(os.sched_getaffinity(0)),
         },
