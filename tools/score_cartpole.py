@@ -10,24 +10,32 @@ For each recording the model is calibrated on all others, as a user would, and p
 - the start state is a local quadratic over these five samples (value and slope in the middle);
 - the prediction is open loop, with the recorded commands, each in force from its time and the latency on;
 - root mean square of prediction minus measurement over all angles from 8 to 4086 counts, all windows of the
-  recording together, cart [mm] and pole [mrad]. Two rows for comparison: a cart-pole that stays as it is, and
-  the model as it is.
+  recording together, cart [mm] and pole [mrad]. For comparison: a cart-pole that stays as it is, the model as
+  it is, and with ``--page`` least squares of one page (tools/one_page.py) on the same recordings, with the
+  same parameters and ranges and the latency. The rotor's inertia has to be in the MJCF for it.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import mujoco
 import numpy as np
+import one_page
 from measuring import head, parser, write_document
 
 import deal_hw
+from deal_hw.calib.data.problem import Problem
+from deal_hw.sim.engine.model import model_with
+from deal_hw.sim.recordings.parts import joined
 from deal_hw.types import FloatArray, IntArray
+from deal_hw.workflows.calibration.intake import calibration_input
+from deal_hw.workflows.calibration.settings import FilesSettings
 
 Search: TypeAlias = Literal["deal", "eki", "deal-paper"]
 PERIOD_S = 0.02
@@ -137,10 +145,37 @@ def scores(
     }
 
 
+def page(
+    folder: Path, files: list[Path], left_out: Path, window_s: float, full_n: float
+) -> dict[str, list[float]]:
+    """Fit windows [s] of all recordings but one by one page of least squares, and predict that one."""
+    work = calibration_input(
+        FilesSettings(
+            model=folder / "cartpole.xml",
+            data=tuple(path for path in files if path != left_out),
+            holdout=(left_out,),
+            columns=folder / "columns.yaml",
+        )
+    )
+    # Whole recordings: its windows must not end where ours were cut.
+    problem = Problem(work.robot, work.space, joined(work.episodes), threads=1)
+    theta, latency_s = one_page.fit(problem, window_s)
+    model = model_with(work.robot, work.space, theta)
+    return scores(model, full_n, latency_s, read(left_out))
+
+
 def fold(
-    folder: Path, files: list[Path], left_out: Path, seed: int, search: Search | None = None
+    folder: Path,
+    files: list[Path],
+    left_out: Path,
+    seed: int,
+    search: Search | None = None,
+    windows_s: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """Calibrate on all recordings but one, with the default's search or another, and predict that one."""
+    """Calibrate on all recordings but one, with the default's search or another, and predict that one.
+
+    ``windows_s`` are the windows of pages of least squares for comparison [s].
+    """
     nominal = mujoco.MjModel.from_xml_path(str(folder / "cartpole.xml"))
     full_n = float(nominal.actuator_gear[0, 0] * nominal.actuator_gainprm[0, 0])
     began, cpu = time.monotonic(), time.process_time()
@@ -159,8 +194,10 @@ def fold(
     print(found.table(), flush=True)
     recording = read(left_out)
     model = mujoco.MjModel.from_xml_path(str(calibrated))
+    pages = {f"page {window_s:g}": page(folder, files, left_out, window_s, full_n) for window_s in windows_s}
     return {
         "left_out": left_out.stem,
+        **pages,
         "calibrated": scores(model, full_n, found.result.latency_s, recording),
         "nominal": scores(nominal, full_n, 0.0, recording),
         "nothing_moves": scores(None, full_n, 0.0, recording),
@@ -181,7 +218,8 @@ def medians(rows: list[dict[str, Any]]) -> dict[str, dict[str, list[float]]]:
             f"{window_s:g}": np.median([row[who][f"{window_s:g}"] for row in rows], axis=0).tolist()
             for window_s in WINDOWS_S
         }
-        for who in ("calibrated", "nominal", "nothing_moves")
+        for who in rows[0]
+        if isinstance(rows[0][who], dict) and "0.2" in rows[0][who]
     }
 
 
@@ -190,6 +228,7 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("folder", type=Path, help="of tools/convert_cartpole.py")
     made.add_argument("--leave-out", nargs="*", default=[], help="names of recordings; default: each one")
     made.add_argument("--search", choices=get_args(Search), help="search of the calibration")
+    made.add_argument("--page", type=float, nargs="*", default=[], help="windows of the page's fits [s]")
     made.add_argument("--seed", type=int, default=0)
     options = made.parse_args(arguments)
     files = sorted(options.folder.glob("*.npz"))
@@ -202,7 +241,7 @@ def main(arguments: list[str] | None = None) -> int:
     for path in files:
         if options.leave_out and path.stem not in options.leave_out:
             continue
-        row = fold(options.folder, files, path, options.seed, options.search)
+        row = fold(options.folder, files, path, options.seed, options.search, options.page)
         result["rows"].append(row)
         print(json.dumps({k: row[k] for k in ("left_out", "calibrated", "processor_seconds")}), flush=True)
         result["median"] = medians(result["rows"])
