@@ -191,7 +191,9 @@ def _friction_by_speed(model: Any, values: Values) -> dict[str, tuple[int, float
 def _late(model: Any, values: Values) -> dict[str, float]:
     """Return how late each actuator's command acts, where it does [s]."""
     own, latency_s = values.get("command_delay", {}), custom_latency_s(model)
-    every = {name: latency_s + own.get(name, 0.0) for name in element_names(model, "actuator")}
+    # Passive elements take no command.
+    names = np.array(element_names(model, "actuator"))[np.asarray(model.actuator_ctrlnum) > 0]
+    every = {str(name): latency_s + own.get(name, 0.0) for name in names}
     return {name: late_s for name, late_s in every.items() if late_s > 0}
 
 
@@ -222,8 +224,8 @@ def hold(model: Any, data: Any, command: FloatArray) -> None:
 
     After a reset of MuJoCo they begin at 0.
     """
-    for actuator, now in enumerate(command):
-        count = int(model.actuator_history[actuator, 0])
+    for actuator in np.flatnonzero(model.actuator_ctrlnum).tolist():
+        now, count = command[model.actuator_ctrladr[actuator]], int(model.actuator_history[actuator, 0])
         if count:
             mujoco.mj_initCtrlHistory(model, data, actuator, None, np.full((count, 1), now))
         if model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_FILTEREXACT:
