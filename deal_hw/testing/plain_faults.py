@@ -110,6 +110,8 @@ CAUSES: Mapping[Fault, tuple[str, ...]] = {
 
 LAWS: Mapping[Fault, tuple[str, ...]] = {
     "friction": ("friction that falls with speed",),
+    "backlash": ("play in the gears",),
+    "motor-play": ("play in the gears",),
     "load-friction": ("friction that grows with the motor's torque", "friction that grows with load"),
     "friction-rise": ("friction that rises with speed",),
     "lag": ("drives that lag",),
@@ -124,8 +126,8 @@ LAWS: Mapping[Fault, tuple[str, ...]] = {
 }
 """The laws that name the fault where the result has one or an alarm names it.
 
-A cause alone does not tell them from others, but for friction, whose cause is its own. A load comes from
-outside and is held by the motor, so its two laws are one fault.
+A cause alone does not tell them from others, but for faults with a cause of their own (`CAUSES`). A load
+comes from outside and is held by the motor, so its two laws are one fault.
 """
 
 SIGN_WORDS = ("sign", "wrong way", "other way", "against")

@@ -122,13 +122,14 @@ def test_a_fault_is_named_by_its_cause_only(
 def test_a_law_names_its_fault_and_its_cause_does_not(fault: str) -> None:
     """All drives have one cause, so the law itself is asked for; every other one is another fault.
 
-    Only Stribeck friction is named by its cause, too.
+    Stribeck friction and play are named by their causes, too.
     """
     own = LAWS[fault]  # type: ignore[index]
     others = [law for laws in LAWS.values() for law in laws if law not in own]
     assert all(names("pendulum", fault, [], [], [law]) for law in own)
     assert not names("pendulum", fault, ["drive", "scale"], [], others)
     assert names("pendulum", fault, ["friction"], [], others) == (fault == "friction")
+    assert names("pendulum", fault, ["backlash"], [], others) == (fault in ("backlash", "motor-play"))
 
 
 @pytest.mark.parametrize(
