@@ -124,4 +124,5 @@ def difference_words(facts: Mapping[str, Any]) -> str:
         return ""
     joint = max(found, key=lambda name: found[name])
     share = "under 0.001 %" if found[joint] < 1e-5 else percent(found[joint])
-    return f"over {WINDOW_S:g} s its motion differs from theirs by {share} of the range at most ({joint})"
+    most = f"{share} of the range at most ({joint})"
+    return f"over {WINDOW_S:g} s its motion differs from that with all laws by {most}"
