@@ -124,8 +124,9 @@ def write_plain_mjcf(
     has = [
         *_delays(late),
         *(f"lag of {name}: a filter of {1e3 * lag_s:.3g} ms" for name, lag_s in lags.items() if lag_s > 0),
-        *(f"friction by speed of {joint}: a passive <dcmotor>, LuGre" for joint in friction),
     ]
+    if friction:
+        has.append(f"friction by speed of {', '.join(friction)}: passive <dcmotor> elements, LuGre")
     expressed = {("command_lag", n) for n in lags} | {("command_delay", n) for n in late}
     expressed |= {(kind, joint) for kind in BY_SPEED for joint in friction}
     lacks = [
