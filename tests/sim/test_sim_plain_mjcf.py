@@ -145,6 +145,23 @@ def test_a_default_class_for_actuators_does_not_hold_for_bristles(tmp_path: Path
     assert model.actuator_gear[0, 0] == 1.1 and model.actuator_forcelimited[0]
 
 
+@pytest.mark.parametrize(("latency_s", "delay_s"), [(0.0009, 0.0), (0.0015, 0.002), (0.0021, 0.0021)])
+def test_a_delay_of_less_than_a_step_is_the_nearer_of_none_and_one(
+    tmp_path: Path, latency_s: float, delay_s: float
+) -> None:
+    """MuJoCo has none between 0 and a step of 2 ms."""
+    _, plain, made = both(tmp_path, SERVO, "shoulder", {"command_lag": 0.0}, latency_s)
+    assert mujoco.MjModel.from_xml_path(str(plain)).actuator_delay.tolist() == pytest.approx([delay_s] * 2)
+    assert bool(made.has) == (delay_s > 0)
+
+
+def test_friction_that_cannot_fall_further_is_constant(tmp_path: Path) -> None:
+    """A joint without dry friction has no less at rest."""
+    smooth = SERVO.replace(' frictionloss="0.1"', "")
+    _, _, made = both(tmp_path, smooth, "shoulder", {"dof_friction_stribeck": -0.05}, 0.0)
+    assert not made.bristles
+
+
 def test_laws_do_not_act_twice(tmp_path: Path) -> None:
     """The loop with laws refuses the model that has them, and says which to give."""
     _, plain, _ = both(tmp_path, SERVO, "shoulder", {"command_lag": 0.02}, 0.0)

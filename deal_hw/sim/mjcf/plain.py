@@ -168,6 +168,8 @@ def _friction_by_speed(model: Any, values: Values) -> dict[str, tuple[int, float
         moving = float(model.dof_frictionloss[dof])
         at_rest = max(moving + extra, 0.0)
         least = min(moving, at_rest)
+        if moving == at_rest:
+            continue
         bend, inertia = (
             BEND[mujoco.mjtJoint(int(model.jnt_type[index]))],
             1 / float(model.dof_invweight0[dof]),
@@ -195,7 +197,8 @@ def _late(model: Any, values: Values) -> dict[str, float]:
     # Passive elements take no command.
     names = np.array(element_names(model, "actuator"))[np.asarray(model.actuator_ctrlnum) > 0]
     every = {str(name): latency_s + own.get(name, 0.0) for name in names}
-    return {name: late_s for name, late_s in every.items() if late_s > 0}
+    # MuJoCo's least delay is one step.
+    return {name: late_s for name, late_s in every.items() if late_s >= model.opt.timestep / 2}
 
 
 def _delays(late: Mapping[str, float]) -> list[str]:
@@ -207,7 +210,6 @@ def _delays(late: Mapping[str, float]) -> list[str]:
 
 
 def _delay(element: Element, late_s: float, step_s: float) -> None:
-    # MuJoCo's least delay is one step.
     element.set("delay", number(max(late_s, step_s)))
     element.set("nsample", str(int(np.ceil(late_s / step_s)) + 2))
     element.set("interp", "linear")
