@@ -11,8 +11,10 @@ import pytest
 from fakes.law_robots import GEARED, MOTOR, SERVO, batch, known, robot, swing
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
+from deal_hw.robots.registry import robot_description
 from deal_hw.sim.actuators import ActuatorLaws
-from deal_hw.sim.engine.model import command_scale
+from deal_hw.sim.engine.model import command_scale, load_model
 from deal_hw.sim.mjcf.calibrated import write_calibrated_mjcf
 from deal_hw.sim.mjcf.plain import PlainModel, hold, write_plain_mjcf
 from deal_hw.types import FloatArray
@@ -160,6 +162,26 @@ def test_friction_that_cannot_fall_further_is_constant(tmp_path: Path) -> None:
     smooth = SERVO.replace(' frictionloss="0.1"', "")
     _, _, made = both(tmp_path, smooth, "shoulder", {"dof_friction_stribeck": -0.05}, 0.0)
     assert not made.bristles
+
+
+@pytest.mark.parametrize("name", ["go2", "so101", "cartpole", "g1", "allegro", "humanoid"])
+def test_our_robots_have_such_models(tmp_path: Path, name: str) -> None:
+    """All laws on all joints: the file compiles, takes the same controls, and moves without a warning."""
+    own = load_model(robot_description(name))
+    loss = own.model.dof_frictionloss
+    rubbing = [j for j, dof in zip(own.description.joint_names, own.qvel, strict=True) if loss[dof] > 0]
+    laws = [known("dof_friction_stribeck", joint, 0.05) for joint in rubbing]
+    lags = [known("command_lag", actuator, 0.01) for actuator in own.actuator_names]
+    space = ParameterSpace((*laws, *lags))
+    write_calibrated_mjcf(own, space, space.nominal, tmp_path / "calibrated.xml", 0.012)
+    made = write_plain_mjcf(tmp_path / "calibrated.xml", tmp_path / "plain.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "plain.xml"))
+    assert made.lacks == () and model.nu == own.model.nu and made.bristles == bool(rubbing)
+    assert np.count_nonzero(model.actuator_delay) == model.nu
+    data = mujoco.MjData(model)
+    hold(model, data, np.zeros(model.nu))
+    mujoco.mj_step(model, data, 100)
+    assert np.isfinite(data.qpos).all() and not data.warning.number.any()
 
 
 def test_laws_do_not_act_twice(tmp_path: Path) -> None:

@@ -121,10 +121,12 @@ def write_plain_mjcf(
         changes.find("actuator", actuator).set("actearly", "true")
     for name, late_s in late.items():
         _delay(changes.find("actuator", element_id(have, "actuator", name)), late_s, have.opt.timestep)
-    has = [
-        *_delays(late),
-        *(f"lag of {name}: a filter of {1e3 * lag_s:.3g} ms" for name, lag_s in lags.items() if lag_s > 0),
-    ]
+    has = []
+    if late:
+        has.append(f"latency: a delay of {_milliseconds(late)}")
+    if lagging:
+        acting = {name: lag_s for name, lag_s in lags.items() if lag_s > 0}
+        has.append(f"lag of {', '.join(acting)}: a filter of {_milliseconds(acting)}")
     if friction:
         has.append(f"friction by speed of {', '.join(friction)}: passive <dcmotor> elements, LuGre")
     expressed = {("command_lag", n) for n in lags} | {("command_delay", n) for n in late}
@@ -201,12 +203,10 @@ def _late(model: Any, values: Values) -> dict[str, float]:
     return {name: late_s for name, late_s in every.items() if late_s >= model.opt.timestep / 2}
 
 
-def _delays(late: Mapping[str, float]) -> list[str]:
-    """Return the delays of all actuators in words."""
-    if not late:
-        return []
-    least, most = (f"{1e3 * end(late.values()):.3g}" for end in (min, max))
-    return [f"latency: a delay of {least if least == most else f'{least} to {most}'} ms"]
+def _milliseconds(times_s: Mapping[str, float]) -> str:
+    """Return times [s] in words, or their range."""
+    least, most = (f"{1e3 * end(times_s.values()):.3g}" for end in (min, max))
+    return f"{least if least == most else f'{least} to {most}'} ms"
 
 
 def _delay(element: Element, late_s: float, step_s: float) -> None:
