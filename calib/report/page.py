@@ -403,15 +403,18 @@ def write_model(robot: RobotModel, result: CalibrationResult, path: Path) -> tup
 
 
 def _write_plain(result: CalibrationResult, folder: Path) -> list[str]:
-    """Write the calibrated model for MuJoCo alone beside the calibrated one; return its files' names."""
-    facts = result.provenance.get(FACTS, {})
+    """Write the calibrated model for MuJoCo alone beside the calibrated one; return its files' names.
+
+    There is none where it could not be made, and of an interrupted calibration.
+    """
+    facts = result.provenance.get(FACTS, {"error": "interrupted"})
     if "error" in facts:
         return []
     words = difference_words(facts)
     made = write_plain_mjcf(
         folder / MODEL,
         folder / PLAIN_MODEL,
-        bristles=bool(facts.get("bristles")),
+        bristles=facts["bristles"],
         remarks=[words] if words else [],
     )
     return [file.name for file in made.files]

@@ -566,7 +566,9 @@ def test_the_residual_is_shown_over_the_motion_of_each_joint(gathered: ReportInp
 def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tmp_path: Path) -> None:
     """Everything is written and read back; without inputs there is no report."""
     robot = load_model(DESCRIPTION)
-    files = write_result(tmp_path / "a", robot, gathered.result, gathered)
+    plain = {"plain_mujoco": {"has": [], "lacks": [], "bristles": False, "difference": {"cart": 0.002}}}
+    result = dataclasses.replace(gathered.result, provenance={**gathered.result.provenance, **plain})
+    files = write_result(tmp_path / "a", robot, result, gathered)
     exports = {"actuators.yaml", "urdf.yaml", "values.yaml", "bam.json"}
     numbers = {"result.json", "distribution.json", "trace.npz"}
     assert set(files) == {*numbers, *exports, "report.html", "calibrated.xml", "plain_mujoco.xml"}
@@ -574,7 +576,10 @@ def test_result_folder_holds_the_report_and_the_model(gathered: ReportInputs, tm
     digest = gathered.result.distribution().digest()
     assert f"method truth, distribution {digest}" in files["calibrated.xml"].read_text()
     assert read_result(tmp_path / "a").method == "truth"
-    assert "report.html" not in write_result(tmp_path / "b", robot, gathered.result)
+    assert "differs from that with all laws by 0.2 % of the range" in files["plain_mujoco.xml"].read_text()
+    # An interrupted calibration has compared nothing.
+    short = write_result(tmp_path / "b", robot, gathered.result)
+    assert not {"report.html", "plain_mujoco.xml"} & set(short) and "calibrated.xml" in short
 
 
 def test_the_model_has_the_physics_step_of_the_fit(gathered: ReportInputs, tmp_path: Path) -> None:
