@@ -6,7 +6,7 @@ import copy
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -26,6 +26,9 @@ FACTS = "plain_mujoco"
 WINDOWS, WINDOW_S = 12, 1.0
 """Most motions that are compared, spread over the recordings, and the longest of them [s]."""
 
+Motion: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Positions and speeds of the joints, (J,) each, and the commands that follow, (S, nu)."""
+
 
 def plain_facts(
     robot: RobotModel, write: Callable[[Path], object], episodes: Sequence[SampledEpisode]
@@ -42,15 +45,20 @@ def plain_facts(
         write: Writes the calibrated MJCF, with its laws in ``<custom>``, to a path.
         episodes: The recordings.
     """
-    compared = robot.base is None and any(len(e.sample) > 2 for e in episodes)
     with tempfile.TemporaryDirectory() as name:
         calibrated, plain = Path(name) / "calibrated.xml", Path(name) / PLAIN_MODEL
         found: list[tuple[float, dict[str, Any]]] = []
         try:
             write(calibrated)
-            for bristles in (True, False) if compared else (False,):
+            model = mujoco.MjModel.from_xml_path(str(calibrated))
+            motions = [] if robot.base is not None else list(_motions(robot, model, episodes))
+            expected = [_with_laws(robot, model, *motion) for motion in motions]
+            for bristles in (True, False) if motions else (False,):
                 made = write_plain_mjcf(calibrated, plain, bristles=bristles)
-                apart = _difference(robot, calibrated, plain, episodes) if compared else None
+                apart = None
+                if motions:
+                    moved = _alone(robot, plain, command_scale(model, range(model.nu)), motions)
+                    apart = _apart(robot, np.concatenate(moved) - np.concatenate(expected), episodes)
                 facts = {"has": list(made.has), "lacks": list(made.lacks), "bristles": made.bristles}
                 mean = float(np.mean(list(apart.values()))) if apart else 0.0
                 found.append((np.nan_to_num(mean, nan=np.inf), facts | {"difference": apart}))
@@ -61,47 +69,54 @@ def plain_facts(
         return min(found, key=lambda one: one[0])[1]
 
 
-def _difference(
-    robot: RobotModel, with_laws: Path, alone: Path, episodes: Sequence[SampledEpisode]
-) -> dict[str, float]:
-    """Return how far apart two models move, by joint, as a share of the recorded range."""
-    calibrated, plain = (mujoco.MjModel.from_xml_path(str(path)) for path in (with_laws, alone))
-    joints, apart = list(robot.qpos), list[FloatArray]()
-    per_ctrl = command_scale(calibrated, range(calibrated.nu))
-    for position, speed, command in _motions(robot, calibrated, episodes):
-        both = []
-        # The laws write into their model.
-        for model, lawful in ((copy.copy(calibrated), True), (plain, False)):
-            data = mujoco.MjData(model)
-            data.qpos[joints], data.qvel[list(robot.qvel)] = position, speed
-            laws = ActuatorLaws(model, data) if lawful else None
-            if laws is not None:
-                laws.restart(command[0])
-            else:
-                hold(model, data, command[0] / per_ctrl)
-            path = np.empty((len(command), len(joints)))
-            for step, now in enumerate(command):
-                if laws is not None:
-                    laws.step(now)
-                else:
-                    data.ctrl[:] = now / per_ctrl
-                    mujoco.mj_step(model, data)
-                path[step] = data.qpos[joints]
-            both.append(path)
-        apart.append(both[0] - both[1])
+def _with_laws(
+    robot: RobotModel, calibrated: Any, position: FloatArray, speed: FloatArray, command: FloatArray
+) -> FloatArray:
+    """Return positions of the joints after each step of a motion with all laws, (S, J)."""
+    # The laws write into their model.
+    model = copy.copy(calibrated)
+    data = mujoco.MjData(model)
+    data.qpos[list(robot.qpos)], data.qvel[list(robot.qvel)] = position, speed
+    laws = ActuatorLaws(model, data)
+    laws.restart(command[0])
+    path = np.empty((len(command), len(robot.qpos)))
+    for step, now in enumerate(command):
+        laws.step(now)
+        path[step] = data.qpos[list(robot.qpos)]
+    return path
+
+
+def _alone(
+    robot: RobotModel, plain: Path, per_ctrl: FloatArray, motions: Sequence[Motion]
+) -> list[FloatArray]:
+    """Return positions of the joints after each step of motions by MuJoCo alone, (S, J) each."""
+    model, paths = mujoco.MjModel.from_xml_path(str(plain)), []
+    for position, speed, command in motions:
+        data = mujoco.MjData(model)
+        data.qpos[list(robot.qpos)], data.qvel[list(robot.qvel)] = position, speed
+        hold(model, data, command[0] / per_ctrl)
+        path = np.empty((len(command), len(robot.qpos)))
+        for step, now in enumerate(command / per_ctrl):
+            data.ctrl[:] = now
+            mujoco.mj_step(model, data)
+            path[step] = data.qpos[list(robot.qpos)]
+        paths.append(path)
+    return paths
+
+
+def _apart(robot: RobotModel, difference: FloatArray, episodes: Sequence[SampledEpisode]) -> dict[str, float]:
+    """Return differences, (S, J), by joint: their root mean square as a share of the recorded range."""
     span = np.ptp(np.concatenate([e.position for e in episodes]), axis=0)
-    rms = np.sqrt(np.mean(np.concatenate(apart) ** 2, axis=0)) / np.maximum(span, 1e-12)
+    rms = np.sqrt(np.mean(difference**2, axis=0)) / np.maximum(span, 1e-12)
     return dict(zip(robot.description.joint_names, map(float, rms), strict=True))
 
 
-def _motions(
-    robot: RobotModel, model: Any, episodes: Sequence[SampledEpisode]
-) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+def _motions(robot: RobotModel, model: Any, episodes: Sequence[SampledEpisode]) -> Iterator[Motion]:
     """Yield positions and speeds of joints, (J,) each, and the commands that follow, (S, nu).
 
     There is one command for each physics step.
     """
-    each = max(WINDOWS // len(episodes), 1)
+    each = max(WINDOWS // max(len(episodes), 1), 1)
     for episode in episodes[:WINDOWS]:
         if len(episode.sample) < 3:
             continue

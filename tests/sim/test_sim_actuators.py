@@ -7,14 +7,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from fakes.law_robots import MOTOR, SERVO, batch, known, robot, swing
+from fakes.law_robots import MOTOR, SERVO, batch, known, moved, robot, swing
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.actuators import ActuatorLaws
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.laws.setpoints import delay, slew
 from deal_hw.sim.mjcf.calibrated import write_calibrated_mjcf
-from deal_hw.types import FloatArray
 
 LATENCY_S = 0.007
 
@@ -24,19 +23,6 @@ def calibrated(tmp_path: Path, members: ServoBatch) -> mujoco.MjModel:
     path = tmp_path / "calibrated.xml"
     write_calibrated_mjcf(members.robot, members.space, members.space.nominal, path, LATENCY_S)
     return mujoco.MjModel.from_xml_path(str(path))
-
-
-def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> FloatArray:
-    """Return reported positions after each step of commands, (S, J)."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = start
-    laws = ActuatorLaws(model, data)
-    laws.restart(commands[0])
-    found = []
-    for command in commands:
-        laws.step(command)
-        found.append(laws.reported())
-    return np.array(found)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from fakes.law_robots import GEARED, MOTOR, SERVO, batch, known, robot, swing
+from fakes.law_robots import GEARED, MOTOR, SERVO, batch, known, moved, robot, swing
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
@@ -31,17 +31,8 @@ def both(
 
 
 def with_laws(path: Path, commands: FloatArray, start: FloatArray) -> FloatArray:
-    """Return positions after each step of commands, (S, J), with the laws in <custom>."""
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    data.qpos[:] = start
-    laws = ActuatorLaws(model, data)
-    laws.restart(commands[0])
-    found = []
-    for command in commands:
-        laws.step(command)
-        found.append(data.qpos.copy())
-    return np.array(found)
+    """Return positions after each step of commands, (S, J), with the laws in <custom>; encoders are right."""
+    return moved(mujoco.MjModel.from_xml_path(str(path)), commands, start)
 
 
 def alone(path: Path, commands: FloatArray, start: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.sim.actuators import ActuatorLaws
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import Sampling, describe
@@ -82,3 +83,16 @@ def swing(steps: int, width: int) -> FloatArray:
     """Return set-points that move through both directions, (1, S, A)."""
     time = np.arange(steps) * 0.002
     return np.stack([0.6 * np.sin(2 * np.pi * (0.7 + 0.4 * k) * time) for k in range(width)], axis=1)[None]
+
+
+def moved(model: mujoco.MjModel, commands: FloatArray, start: FloatArray) -> FloatArray:
+    """Return reported positions after each step of commands in a loop with the laws, (S, J)."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    laws = ActuatorLaws(model, data)
+    laws.restart(commands[0])
+    found = []
+    for command in commands:
+        laws.step(command)
+        found.append(laws.reported())
+    return np.array(found)

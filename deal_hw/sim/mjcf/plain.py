@@ -41,7 +41,6 @@ from deal_hw.sim.mjcf.changes import MjcfChanges, number, numbers
 from deal_hw.sim.mjcf.paths import Relocation
 from deal_hw.sim.mjcf.text import Element, SourceFile, new_element, read_files
 from deal_hw.sim.parameters import DEVICE_KINDS
-from deal_hw.sim.parameters.drive import filtered
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.laws import FRICTION_KINDS, STRIBECK_SPEED
 from deal_hw.types import FloatArray
@@ -112,7 +111,8 @@ def write_plain_mjcf(
         want.dof_frictionloss[dof] = least
     lagging = {element_id(have, "actuator", name): lag_s for name, lag_s in lags.items() if lag_s > 0}
     for actuator, lag_s in lagging.items():
-        _filter(want, actuator, lag_s)
+        want.actuator_dyntype[actuator] = mujoco.mjtDyn.mjDYN_FILTEREXACT
+        want.actuator_dynprm[actuator, 0] = lag_s
     relocation, changes = Relocation(top, target), MjcfChanges(top.root, have, bool(spec.compiler.degree))
     relocation.adapt()
     changes.apply(have, want)
@@ -172,11 +172,10 @@ def _friction_by_speed(model: Any, values: Values) -> dict[str, tuple[int, float
         least = min(moving, at_rest)
         if moving == at_rest:
             continue
-        bend, inertia = (
-            BEND[mujoco.mjtJoint(int(model.jnt_type[index]))],
-            1 / float(model.dof_invweight0[dof]),
-        )
-        stiffness = min(abs(moving - at_rest) / bend, inertia * (STIFFEST / float(model.opt.timestep)) ** 2)
+        bend = BEND[mujoco.mjtJoint(int(model.jnt_type[index]))]
+        inertia = 1 / float(model.dof_invweight0[dof])
+        stiffest = inertia * (STIFFEST / float(model.opt.timestep)) ** 2
+        stiffness = min(abs(moving - at_rest) / bend, stiffest)
         speed = speeds.get(joint, STRIBECK_SPEED)
         bristles = new_element(
             "dcmotor",
@@ -213,13 +212,6 @@ def _delay(element: Element, late_s: float, step_s: float) -> None:
     element.set("delay", number(max(late_s, step_s)))
     element.set("nsample", str(int(np.ceil(late_s / step_s)) + 2))
     element.set("interp", "linear")
-
-
-def _filter(model: Any, actuator: int, lag_s: float) -> None:
-    """Give an actuator a first-order lag of its command; one that has a filter has it already."""
-    if not filtered(model, actuator):
-        model.actuator_dyntype[actuator] = mujoco.mjtDyn.mjDYN_FILTEREXACT
-        model.actuator_dynprm[actuator, 0] = lag_s
 
 
 def hold(model: Any, data: Any, command: FloatArray) -> None:
