@@ -165,7 +165,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
         problem = run.problem
         from deal_hw.calib.fit.channel_weights import weight_channels
-        from deal_hw.calib.validation.explain import FAR, try_explanations
+        from deal_hw.calib.validation.explain import try_explanations
 
         # Another minimum can leave a residual as small as noise, but with a pattern.
         white = local is not None and conclusive(problem, local, WHITE_SAMPLES)
@@ -189,9 +189,8 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 local = with_rows(local)
                 report_unidentifiable(problem, local, progress)
             run = dataclasses.replace(run, local=local)
-            # Around a poor fit only play and what is 0 would be fitted; see `try_explanations`.
-            later = local is not None and local.chi2 > FAR and self.fits.tries_laws(run)
-            if local is not None and self.settings.diagnosis and not later:
+            # Around a poor fit only play and what is 0 are fitted; see `try_explanations`.
+            if local is not None and self.settings.diagnosis:
                 with run.check(EXPLANATIONS):
                     tried = try_explanations(problem, with_rows(local), run.may_try, say=run.ask)
                 run = dataclasses.replace(run, tried=tried)
