@@ -152,9 +152,7 @@ class CalibrationRun:
 
     def takes(self, explanation: Explanation) -> bool:
         """Return whether the result may have an explanation: without laws, what an MJCF can say."""
-        from deal_hw.calib.validation.explanations import ZEROS
-
-        return self.settings.laws or explanation in ZEROS
+        return self.settings.laws or explanation.in_mjcf
 
     def ask(self, law: str) -> None:
         """Report that a law is tried."""

@@ -73,6 +73,7 @@ from deal_hw.findings import Finding
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
     from deal_hw.calib.validation.cause_words import Diagnosis
+    from deal_hw.calib.validation.explain import Explained
     from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
@@ -298,10 +299,9 @@ def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
     The local fit may be in another minimum, around which other laws gain.
     """
     from deal_hw.calib.validation.checks import unexplained
-    from deal_hw.calib.validation.explain import try_explanations
-    from deal_hw.calib.validation.explanations import ZEROS
+    from deal_hw.calib.validation.explain import applicable, of_masses, try_explanations
 
-    takes = run.settings.laws or any(each.parameters(run.problem) for each in ZEROS)
+    takes = run.settings.laws or of_masses(run.problem) or any(e.in_mjcf for e in applicable(run.problem))
     if not (run.settings.diagnosis and takes and unexplained(refined)):
         return run
     if run.local is not None and np.array_equal(run.local.theta, refined.theta):
@@ -479,6 +479,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     No search follows: nothing but noise is left to explain. ``searched`` is the result of an earlier one.
     """
     from deal_hw.calib.validation.candidates import law_candidates, ranked
+    from deal_hw.calib.validation.checks import hold_shifts
     from deal_hw.calib.validation.explain import explained, rivals
 
     tried = [one for one in run.tried if run.takes(one.explanation)]
@@ -488,23 +489,32 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         found = explained(run.problem, run.local, tried)
     if not found or not found[0].explains:
         return None
-    best, *others = rivals(found)
-    wide = dataclasses.replace(run, problem=best.problem, progress=None)
-    run.say("fit", f"{best.explanation.name} on all recordings")
-    fit = refined_from(wide, best.theta, best.latency_s)
-    if not conclusive(best.problem, fit):
-        run.inexact.add(best.explanation.name)
+    exact: list[tuple[Explained, Refined]] = []
+    for one in rivals([one for one in found if one.explains]):
+        name, wide = one.explanation.name, dataclasses.replace(run, problem=one.problem, progress=None)
+        run.say("fit", f"{name} on all recordings")
+        fit = refined_from(wide, one.theta, one.latency_s)
+        if conclusive(one.problem, fit):
+            exact.append((dataclasses.replace(one, theta=fit.theta, latency_s=fit.latency_s), fit))
+        else:
+            run.inexact.add(name)
+    if not exact:
         return None
+    # The model's own values are somebody's best guess, so of those that explain alike the nearest is taken.
+    (best, fit), *others = sorted(exact, key=lambda pair: pair[0].change)
+    wide = dataclasses.replace(run, problem=best.problem, progress=None)
     do = best.explanation.taken.replace("{}", listed(best.added))
+    names, shifts = [one.explanation.name for one, _ in others], [best.shift_to(one) for one, _ in others]
     if others:
-        names = [one.explanation.name for one in others]
         do += f" Recordings like these do not tell it from {listed(names)}."
     alarm = dataclasses.replace(best.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
-    rows = law_candidates(run.tried, found, best.explanation.name, [one.explanation.name for one in others])
-    return conclude_fit(wide, searched, fit).with_alarms(
+    rows = law_candidates(run.tried, found, best.explanation.name, names)
+    outcome = conclude_fit(wide, searched, fit)
+    known = hold_shifts(best.problem, outcome.known, outcome.latency_s, shifts)
+    return dataclasses.replace(outcome, known=known).with_alarms(
         alarm,
-        diagnosis=[one.diagnosis.to_json() for one in (best, *others)],
+        diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, _ in others))],
         candidates=[row.to_json() for row in ranked(rows)],
     )
 

@@ -134,10 +134,27 @@ def hold_windows(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertai
         moved = space.to_scale(other.theta) - space.to_scale(known.theta)
         square = np.append(moved, other.latency_s - latency_s) ** 2
         excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
-    excess[:-1][known.blind] = 0.0
-    wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
+    return hold_shifts(problem, known, latency_s, [excess])
+
+
+def hold_shifts(
+    problem: Problem, known: Uncertainty, latency_s: float, shifts: Sequence[FloatArray]
+) -> Uncertainty:
+    """Return ``known`` with intervals that hold what other models say that predict as well.
+
+    Args:
+        problem: The problem.
+        known: The uncertainty of an estimate.
+        latency_s: Its latency [s].
+        shifts: Where each of the others puts the values, in their scales, and the latency [s], (K + 1,).
+    """
+    if not shifts:
+        return known
+    most = np.max(np.abs(shifts), axis=0)
+    most[:-1][known.blind] = 0.0
+    wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + most[:-1] / Z90)
     if reach_s := known.latency_reach_s(latency_s):
-        wider = wider.latency_widened_to(reach_s + excess[-1], latency_s, problem.latency_range_s)
+        wider = wider.latency_widened_to(reach_s + most[-1], latency_s, problem.latency_range_s)
     return wider
 
 

@@ -32,6 +32,8 @@ from deal_hw.calib.validation.explain import (
     Allows,
     Tried,
     explained,
+    keeps_mass,
+    likeliest,
     try_explanations,
 )
 from deal_hw.calib.validation.random_delay import random_delay
@@ -81,9 +83,6 @@ BURST_LEFT = 4.0
 MASS = "another mass"
 """Name of a check."""
 
-LEAST_RISE = 0.01
-"""Least distance of a found mass from the lower end of its range, as a share [-]."""
-
 
 def all_allowed(name: str, steps: float) -> bool:
     """Allow every check."""
@@ -108,37 +107,39 @@ def diagnose(
     known = functools.cache(lambda: evidence(problem, refined))
     tried = try_explanations(problem, refined, allows, tried, known)
     laws = explained(problem, refined, tried)
-    wider, rows = [one.diagnosis for one in laws], list[Candidate]()
+    wider, rows = [one.diagnosis for one in likeliest(laws)], list[Candidate]()
     found, effects = [one for one in wider if one.share >= DECISIVE], list[Diagnosis]()
     unsure = np.zeros(0)
     if not found:
         wider = [one for one in wider if supported(one.share, refined.chi2)]
         named = {one.code for one in wider}
         effects = [one for one in name_causes(known(), refined.chi2) if one.code not in named]
-        effects = [one for one in effects if one.code != "mass" or weighs(problem, refined, one, allows)]
+        effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
         found = sorted((*effects, *wider), key=lambda f: -f.deviance)
-        rows += effect_candidates(known(), effects)
+        again = {one.explanation.name for one in tried}
+        rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
         if refined.chi2 <= POOR:
             unsure = unsure_shift(known(), {one.code for one in found})
     rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
     return Diagnosed(tuple(found), ranked(rows), unsure)
 
 
-def weighs(problem: Problem, refined: Refined, cause: Diagnosis, allows: Allows) -> bool:
+def weighs(
+    problem: Problem, refined: Refined, cause: Diagnosis, tried: Sequence[Tried], allows: Allows
+) -> bool:
     """Return whether a model with another mass of the named body predicts unseen motion better, too.
 
-    The signature is the effect of 2 % of the mass, and the cause may be far more. A body that keeps less than
-    a fifth of its mass is no body with another mass: its mass takes up something else. Where no wider model
-    is fitted, as for a free base and without noise, the signature stands.
+    The signature is the effect of 2 % of the mass, and the cause may be far more. It was not tried where the
+    fit is poor. Where no wider model is fitted, as for a free base and without noise, the signature stands.
     """
     body = next(p for p in masses(problem) if p.elements[0] == cause.subject[0])
-    fixed = problem.robot.base is None and not problem.noise_free
-    if not (fixed and allows(MASS, wider_cost(problem, True, 1))):
-        return True
-    wide = fit_wider(problem, [body])
-    if wide is None or wide.found[0] <= body.low * (1 + LEAST_RISE):
-        return False
-    return gain_of(wide, refined) is not None
+    wide = next((one.wider for one in tried if one.wider is not None and one.wider.more == [body]), None)
+    if wide is None:
+        fixed = problem.robot.base is None and not problem.noise_free
+        if not (fixed and allows(MASS, wider_cost(problem, True, 1))):
+            return True
+        wide = fit_wider(problem, [body])
+    return wide is not None and keeps_mass(body, wide.found[0]) and gain_of(wide, refined) is not None
 
 
 def supported(share: float, chi2: float) -> bool:

@@ -30,6 +30,7 @@ from deal_hw.calib.validation.explanations import (
     Explanation,
     off_value,
     one_sided,
+    other_masses,
     sized,
     tried_value,
 )
@@ -37,7 +38,7 @@ from deal_hw.calib.validation.signatures import Signature, whitened_changes
 from deal_hw.calib.validation.wider_models import WiderFit, fit_wider, gain_of, wider_cost
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
-from deal_hw.parameters import Parameter
+from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.types import FloatArray
 
 Allows = Callable[[str, float], bool]
@@ -59,6 +60,9 @@ LEAST_PLAY = 0.2
 
 SURE = 5.0
 """Least value of a named parameter, in its standard deviations [-]."""
+
+LEAST_RISE = 0.01
+"""Least distance of a found mass from the lower end of its range, as a share [-]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +113,25 @@ class Explained:
         return self.chi2 < MISMATCH_CHI2 and self.before - self.chi2 >= DECISIVE * (self.before - 1)
 
     @property
+    def change(self) -> float:
+        """Change of the model's own values, root mean square, in widths of their ranges."""
+        own = ParameterSpace(self.problem.space.parameters[: -len(self.added)])
+        moved = own.to_scale(self.theta[: len(own)]) - own.to_scale(own.nominal)
+        return float(np.sqrt(np.mean((moved / own.width) ** 2)))
+
+    def shift_to(self, other: Explained) -> FloatArray:
+        """Return the change of the values and the latency [s] if another explanation is true, (K + 1,).
+
+        Own values go to those of the other one, and further ones to where they have no effect.
+        """
+        space, K = self.problem.space, len(self.problem.space) - len(self.added)
+        at = self.theta.copy()
+        at[:K] = other.theta[:K]
+        for k, p in enumerate(space.parameters[K:], K):
+            at[k] = at[k] if p.kind in SHAPES else off_value(p)
+        return np.append(space.to_scale(at) - space.to_scale(self.theta), other.latency_s - self.latency_s)
+
+    @property
     def added(self) -> tuple[str, ...]:
         """Names of its parameters in :attr:`problem`."""
         own = len(self.diagnosis.shift) - 1
@@ -127,6 +150,13 @@ def applicable(problem: Problem) -> dict[Explanation, list[Parameter]]:
     return {each: more for each in EXPLANATIONS if (more := each.parameters(problem))}
 
 
+def of_masses(problem: Problem) -> dict[Explanation, list[Parameter]]:
+    """Return another mass of each body with its parameter: for fixed bases, with noise."""
+    if problem.robot.base is not None or problem.noise_free:
+        return {}
+    return {each: each.parameters(problem) for each in other_masses(problem)}
+
+
 def try_explanations(
     problem: Problem,
     refined: Refined,
@@ -139,7 +169,9 @@ def try_explanations(
 
     Play is always fitted: its effect around a fit without it says little, as nothing moves within it. So is a
     lag: its linearised effect is that of a delay, which the fit has. Around a poor fit the effect says little
-    of all of them, so only play is fitted then, and what is 0 in the model: the simplest reason.
+    of all of them, so only play is fitted then, and what is 0 in the model: the simplest reason. Each body's
+    mass is screened beside the laws. Where one leaves only noise, all that gain are fitted: in a fit without
+    it ranges may hide that another one does so, too.
 
     Args:
         problem: The problem.
@@ -151,19 +183,22 @@ def try_explanations(
     """
     if any(one.of is problem for one in given):
         return tuple(one for one in given if one.of is problem)
-    can = applicable(problem)
+    can, masses = applicable(problem), of_masses(problem)
     if refined.chi2 > FAR:
-        can = {each: more for each, more in can.items() if each in (*ZEROS, PLAY)}
+        can, masses = {each: more for each, more in can.items() if each in (*ZEROS, PLAY)}, {}
         gains, enough = dict.fromkeys(can, 0.0), -np.inf
-    elif can:
-        gains, enough = _gains(problem, refined, can, known)
+    elif can or masses:
+        gains, enough = _gains(problem, refined, can | masses, known)
     found = []
-    for each, more in can.items():
+    for each, more in [*can.items(), *sorted(masses.items(), key=lambda pair: -gains[pair[0]])]:
         fitted = each in (PLAY, LAG) or gains[each] > enough
         fitted = fitted and allows(each.name, wider_cost(problem, True, len(more)))
         if fitted:
             say(each.name)
-        found.append(Tried(each, problem, gains[each], fit_wider(problem, more) if fitted else None))
+        wide = fit_wider(problem, more) if fitted else None
+        found.append(Tried(each, problem, gains[each], wide))
+        if each in masses and wide is not None and wide.prediction.chi2 < MISMATCH_CHI2:
+            enough = EVIDENCE
     return tuple(found)
 
 
@@ -257,6 +292,23 @@ def rivals(found: Sequence[Explained]) -> list[Explained]:
     return [one for one in found if found[0].diagnosis.deviance - one.diagnosis.deviance < EVIDENCE]
 
 
+def likeliest(found: Sequence[Explained]) -> list[Explained]:
+    """Return the explanations without masses that predict worse than another body's, beyond chance.
+
+    Where one mass is wrong, the others gain, too.
+    """
+    best = {id(one) for one in rivals([one for one in found if one.diagnosis.code == "mass"])}
+    return [one for one in found if one.diagnosis.code != "mass" or id(one) in best]
+
+
+def keeps_mass(p: Parameter, value: float) -> bool:
+    """Return whether a found mass is one: a body that keeps less than a fifth of its mass has no other mass.
+
+    Its mass takes up something else.
+    """
+    return value > p.low * (1 + LEAST_RISE)
+
+
 def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | None:
     wide, of = tried.wider, tried.explanation
     gained = None if wide is None else gain_of(wide, refined)
@@ -272,7 +324,7 @@ def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | 
             [f"{wide.found[k]:.2g} {wide.more[k].unit} at {wide.more[k].elements[0]}" for k in order]
         )
     else:
-        sizes = listed([f"{wide.more[k].name} = {wide.found[k]:.2g} {wide.more[k].unit}" for k in order])
+        sizes = listed([_value(wide.more[k], wide.found[k]) for k in order])
     seen = (
         f"With {of.name} ({sizes}) the model predicts motion that it was not fitted to with chi2 "
         f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: {of.cause}."
@@ -286,11 +338,20 @@ def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | 
     )
 
 
+def _value(p: Parameter, found: float) -> str:
+    """Return a parameter with its value, and the model's where that is a quantity of its own."""
+    model = f", in the model {p.nominal:.2g}" if p.kind == "body_mass" else ""
+    return f"{p.name} = {found:.2g} {p.unit}{model}"
+
+
 def _named(wide: WiderFit, of: Explanation) -> list[int]:
     """Return the parameters that are sure, largest first, then those that shape them."""
     if of is PLAY:
         found = wide.found
         return [int(k) for k in np.argsort(-found) if found[k] >= LEAST_PLAY * found.max() > 0]
+    if of.cause == "mass":
+        # The scale of masses, gains and friction may be free. What a single value gains is its evidence.
+        return [k for k, p in enumerate(wide.more) if keeps_mass(p, wide.found[k])]
     off = np.array([off_value(p) for p in wide.more])
     sure = np.where([p.kind in SHAPES for p in wide.more], 0.0, np.abs(wide.significance(off)))
     sizes = [int(k) for k in np.argsort(-sure) if sure[k] > SURE]

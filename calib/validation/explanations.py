@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.validation.signatures import Cause
+from deal_hw.calib.validation.cause_words import LOOKS
+from deal_hw.calib.validation.signatures import Cause, masses
 from deal_hw.calib.validation.wider_models import MOST_FORCE, motion, zero_parameters
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
@@ -67,6 +69,7 @@ class Explanation:
         means: What it means.
         do: What to do about it, with {} for the joints or bodies.
         taken: What to do where the result has it, with {} for the names of its parameters there.
+        in_mjcf: Whether an MJCF can say it.
     """
 
     name: str
@@ -75,6 +78,7 @@ class Explanation:
     means: str
     do: str
     taken: str
+    in_mjcf: bool = False
 
 
 def _friction(problem: Problem) -> list[Parameter]:
@@ -231,13 +235,16 @@ _WRITE = (
 )
 _TAKE = "Use this result: it has them as {}, and so has its MJCF."
 
+
+def _zero(name: str, cause: Cause, parameters: Callable[[Problem], list[Parameter]]) -> Explanation:
+    return Explanation(name, cause, parameters, _NOT_SEARCHED, _WRITE, _TAKE, in_mjcf=True)
+
+
 ZEROS: Sequence[Explanation] = (
-    Explanation("dry friction that is 0 in the model", "friction", _friction, _NOT_SEARCHED, _WRITE, _TAKE),
-    Explanation("damping that is 0 in the model", "damping", _damping, _NOT_SEARCHED, _WRITE, _TAKE),
-    Explanation("a rotor's inertia that is 0 in the model", "inertia", _rotor, _NOT_SEARCHED, _WRITE, _TAKE),
-    Explanation(
-        "several quantities that are 0 in the model", "inertia", _together, _NOT_SEARCHED, _WRITE, _TAKE
-    ),
+    _zero("dry friction that is 0 in the model", "friction", _friction),
+    _zero("damping that is 0 in the model", "damping", _damping),
+    _zero("a rotor's inertia that is 0 in the model", "inertia", _rotor),
+    _zero("several quantities that are 0 in the model", "inertia", _together),
 )
 """Quantities that an MJCF can say, and this one does not: a model made from a URDF often has none of them."""
 
@@ -349,6 +356,26 @@ EXPLANATIONS: Sequence[Explanation] = (
 """Candidates, those with the fewest parameters first."""
 
 
+def other_masses(problem: Problem) -> list[Explanation]:
+    """Return another mass of each moving body, each an explanation of its own.
+
+    Motion under position servos shows ratios of masses, so all of them at once would not be determined.
+    """
+    looks, means, do = LOOKS["mass"]
+    taken = "Weigh that body. Until then use this result: it has the mass as {}, and so has its MJCF."
+    return [
+        Explanation(
+            f"{looks} of {p.elements[0]}", "mass", partial(_alone, mass=p), means, do, taken, in_mjcf=True
+        )
+        for p in masses(problem)
+    ]
+
+
+def _alone(problem: Problem, *, mass: Parameter) -> list[Parameter]:
+    del problem
+    return [mass]
+
+
 TRIED = 0.02
 """Value whose effect is simulated where a fit begins at 0, as a share of the largest one [-]."""
 
@@ -360,7 +387,7 @@ def off_value(p: Parameter) -> float:
     """Return the value at which a parameter has no effect, or the least in its range."""
     if p.kind == FREE_SPEED:
         return p.high
-    return p.nominal if p.kind in (*SHAPES, ENCODER_SCALE) else 0.0
+    return p.nominal if p.kind in (*SHAPES, ENCODER_SCALE, "body_mass") else 0.0
 
 
 def sized(parameters: Sequence[Parameter]) -> list[int]:

@@ -547,7 +547,7 @@ def test_a_mass_is_named_with_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
         theta = np.append(wide.fit.theta[:-1], share * wide.more[0].nominal)
         found_at = dataclasses.replace(wide, fit=dataclasses.replace(wide.fit, theta=theta))
         monkeypatch.setattr(diagnosis, "fit_wider", lambda *_: found_at)
-        return weighs(problem, fit, found[0], all_allowed)
+        return weighs(problem, fit, found[0], (), all_allowed)
 
     assert said(1.5) and not said(0.2)
     monkeypatch.setattr(diagnosis, "gain_of", lambda *_: None)

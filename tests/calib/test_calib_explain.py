@@ -334,7 +334,7 @@ def test_laws_are_tried_once_around_one_fit() -> None:
     run = small_run(problem, local=fit)
     assert with_laws_tried(run, poor) is run
     assert with_laws_tried(small_run(problem), dataclasses.replace(fit, chi2=0.9)).tried == ()
-    unasked = small_run(problem, settings=Validation(laws=False))
+    unasked = small_run(problem, settings=Validation(diagnosis=False))
     assert with_laws_tried(unasked, poor) is unasked
 
 

@@ -1,0 +1,150 @@
+"""Another mass of a body as a candidate: it is fitted, taken, and told from that of another body or not."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from fakes.plain_truth import problem_of, refused, truth
+from fakes.small_runs import small_run
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, uncertainty_at, with_rows
+from deal_hw.calib.fit.refinement import local_fit
+from deal_hw.calib.pipeline.stages import with_explanation
+from deal_hw.calib.validation.cause_words import Diagnosis
+from deal_hw.calib.validation.checks import hold_shifts
+from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
+from deal_hw.calib.validation.explain import (
+    FAR,
+    Explained,
+    explained,
+    keeps_mass,
+    likeliest,
+    of_masses,
+    rivals,
+    try_explanations,
+)
+from deal_hw.calib.validation.explanations import off_value, one_sided, other_masses, tried_value
+from deal_hw.calib.validation.settings import Validation
+from deal_hw.calibration import Z90
+from deal_hw.findings import Finding
+from deal_hw.parameters import Parameter
+from deal_hw.testing.plain_robots import make_robot
+
+UPPER, FORE = "another mass of upper", "another mass of fore"
+LINK = 1.5
+"""Mass of the robot's last link over the model's."""
+
+
+def test_each_moving_body_has_another_mass_of_its_own(tmp_path: Path) -> None:
+    """From its own mass to both sides; one that is searched already is no candidate, nor is a free base's."""
+    problem = problem_of(make_robot("double-pendulum", 3), tmp_path)
+    of = of_masses(problem)
+    assert [each.name for each in of] == [UPPER, FORE] and all(each.in_mjcf for each in of)
+    ((upper,), (fore,)) = of.values()
+    assert (upper.name, upper.kind, upper.nominal, fore.nominal) == ("upper.mass", "body_mass", 0.5, 0.3)
+    assert off_value(fore) == 0.3 and tried_value(fore) == pytest.approx(0.3 + 0.02 * (1.5 - 0.06))
+    assert not one_sided(problem, [fore]).any()
+    assert [each.name for each in other_masses(problem.with_more([upper]))] == [FORE]
+    floating: Any = SimpleNamespace(robot=SimpleNamespace(base="trunk"), noise_free=False)
+    assert of_masses(floating) == {}
+
+
+def test_a_body_that_keeps_nothing_has_no_other_mass() -> None:
+    """Searched from a fifth of the mass on; at that end the mass takes up something else."""
+    p = Parameter.around("fore.mass", "body_mass", ("fore",), "kg", 0.3)
+    assert [keeps_mass(p, value) for value in (0.06, 0.0605, 0.07, 0.45)] == [False, False, True, True]
+
+
+def test_around_a_poor_fit_no_mass_is_fitted() -> None:
+    """Its effect there says nothing, and near the noise the same masses are screened."""
+    _, problem, fit = truth("double-pendulum", None)
+    poor = try_explanations(problem, dataclasses.replace(fit, chi2=FAR + 1), refused)
+    near = try_explanations(problem, fit, refused)
+    assert not {UPPER, FORE} & {one.explanation.name for one in poor}
+    assert {UPPER, FORE} <= {one.explanation.name for one in near}
+
+
+def _explained(problem: Problem, body: str, deviance: float, own: float, mass: float) -> Explained:
+    """Return an explanation by another mass, with all own values ``own`` times the model's."""
+    law = next(each for each in other_masses(problem) if each.name.endswith(body))
+    wide = problem.with_more(law.parameters(problem))
+    theta = np.append(own * problem.space.nominal, mass)
+    alarm = Finding.alarm("a", "b", "c")
+    cause = Diagnosis.of("mass", 0.6, deviance, (body,), alarm)
+    return Explained(law, cause, wide, theta, 0.01, 1.0, 2.0)
+
+
+def test_the_other_body_is_where_the_values_go_if_it_is_true(tmp_path: Path) -> None:
+    """1.5 times all other values and the lower link's mass, or 1/1.5 of the upper one's: the same motion."""
+    problem = problem_of(make_robot("double-pendulum", 3), tmp_path)
+    K = len(problem.space)
+    fore = _explained(problem, "fore", 100.0, 1.5, 0.45)
+    upper = dataclasses.replace(_explained(problem, "upper", 90.0, 1.0, 0.5 / 1.5), latency_s=0.012)
+    assert upper.change == pytest.approx(0.0)
+    assert fore.change == pytest.approx(np.log(1.5) / problem.space.width.mean(), rel=0.3)
+    shift = fore.shift_to(upper)
+    assert shift[:K] == pytest.approx(np.full(K, -np.log(1.5)))
+    # The lower link then has the model's mass.
+    assert shift[K:] == pytest.approx([-np.log(1.5), 0.002])
+    poor = dataclasses.replace(upper, diagnosis=dataclasses.replace(upper.diagnosis, deviance=70.0))
+
+    def bodies(found: list[Explained]) -> list[str]:
+        return [one.explanation.name for one in found]
+
+    assert bodies(rivals([fore, upper])) == bodies(likeliest([fore, upper])) == [FORE, UPPER]
+    assert bodies(likeliest([fore, poor])) == [FORE]
+
+
+def test_intervals_hold_what_other_models_say() -> None:
+    """Each goes as far as the farthest of them, on top of its own width; a blind value keeps its range."""
+    _, problem, fit = truth("pendulum", None)
+    known = uncertainty_at(problem, fit, fixed_latency=False)
+    K, before = len(known.space), np.sqrt(np.diag(known.covariance))
+    shifts = [np.full(K + 1, 0.1), np.append(np.full(K, -0.2), 0.001)]
+    held = hold_shifts(problem, known, fit.latency_s, shifts)
+    expected = np.where(known.blind, before, before + 0.2 / Z90)
+    assert np.sqrt(np.diag(held.covariance)) == pytest.approx(expected)
+    assert held.latency_reach_s(fit.latency_s) >= known.latency_reach_s(fit.latency_s)
+    assert hold_shifts(problem, known, fit.latency_s, []) is known
+
+
+@pytest.mark.slow
+def test_a_wrong_mass_becomes_a_parameter_and_the_other_body_is_named() -> None:
+    """The last link weighs 50 % more. Under servos motion shows ratios of masses: two bodies explain alike.
+
+    That is taken with which the other values change less, and the intervals hold those of both, so the truth.
+    """
+    robot, problem, _ = truth("double-pendulum", "mass")
+    local = local_fit(problem)
+    assert local is not None
+    fit = with_rows(local)
+    tried = try_explanations(problem, fit, all_allowed)
+    found = explained(problem, fit, tried)
+    assert {one.explanation.name for one in rivals(found)} == {UPPER, FORE}
+    assert "in the model 0." in found[0].diagnosis.seen and found[0].explains
+    # An MJCF can say it, so those who want no laws get it, too.
+    outcome = with_explanation(small_run(problem, settings=Validation(laws=False), local=fit, tried=tried))
+    assert outcome is not None and outcome.chi2 < MISMATCH_CHI2 and outcome.space is not None
+    K, (mass,) = len(problem.space), outcome.space.names[len(problem.space) :]
+    # Both masses together are the robot's, up to one factor, which all other values have, too.
+    ratio = outcome.theta[K] / outcome.space.nominal[K]
+    factor = 1.0 if mass == "fore.mass" else 1 / LINK
+    assert ratio == pytest.approx(LINK * factor if mass == "fore.mass" else factor, rel=0.03)
+    true = np.array([robot.truth[name] for name in problem.space.names])
+    assert np.median(outcome.theta[:K] / true) == pytest.approx(factor, rel=0.03)
+    low, high = outcome.known.interval[:K].T
+    assert np.mean((low <= true) & (true <= high)) >= 0.9
+    rows = {row["explanation"]: row["outcome"] for row in outcome.facts["candidates"]}
+    assert sorted((rows[UPPER], rows[FORE])) == ["named", "taken"]
+    (alarm,) = [one for one in outcome.known.alarms if "do not tell it from" in one.do]
+    assert f"it has the mass as {mass}" in alarm.do
+    causes = diagnose(problem, fit, tried)
+    assert causes.causes[0].code == "mass"
+    names = [row.explanation for row in causes.candidates]
+    assert len(names) == len(set(names))
