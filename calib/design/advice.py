@@ -2,7 +2,8 @@
 
 Each excitation of a menu is simulated at the estimate, and its Fisher information is added to that of the
 recordings so far. An interval is promised to shrink by as much as that information says. What widened it,
-such as an error of the model, will be in the next recording, too.
+such as an error of the model, will be in the next recording, too. What explanations that predict alike add to
+it (``alike_std`` in a result's provenance) stays.
 """
 
 from __future__ import annotations
@@ -181,10 +182,13 @@ def advise(
     # The ranges bound what the recordings leave open.
     prior = Prior(seen + Prior.of(dataclasses.replace(known, covariance=None)).information)
     predictions = predict_menu(robot, known, menu, prior, balance=balance, threads=threads)
-    wider = before / np.sqrt(np.diag(np.linalg.inv(prior.information))[:K])
+    added = result.provenance.get("alike_std", {})
+    alike = np.minimum([float(added.get(name, 0.0)) for name in space.names], before)
+    own = np.sqrt(before**2 - alike**2)
+    wider = own / np.sqrt(np.diag(np.linalg.inv(prior.information))[:K])
     found = []
     for k in open_:
-        one = _advice(space, k, float(before[k]), predictions, float(wider[k]), WORTH)
+        one = _advice(space, k, float(before[k]), predictions, float(wider[k]), float(alike[k]))
         command = options(designs[one.excitation]) if one.excitation else ""
         found.append(dataclasses.replace(one, command=command))
     return tuple(found)
@@ -214,8 +218,9 @@ def _advice(
     before: float,
     predictions: Mapping[str, ExpectedInformation],
     widened: float,
-    worth: float,
+    alike: float,
 ) -> Advice:
+    """Return a parameter's advice: excitations shrink its standard deviation ``before`` down to ``alike``."""
     name, prior = space.names[k], float(space.width[k] / np.sqrt(12.0))
     now = std_words(space.free[k], before)
     usable = {name: found for name, found in predictions.items() if found.usable}
@@ -226,11 +231,11 @@ def _advice(
         )
         return Advice(name, before, before, "", sentence)
     best = min(usable, key=lambda name: float(usable[name].std[k]))
-    after = min(widened * float(usable[best].std[k]), before)
-    if after > worth * before:
+    after = min(math.hypot(widened * float(usable[best].std[k]), alike), before)
+    if after > WORTH * before:
         how = (
             "measure it by other means (scale, ruler, stall torque), or give what it is bound to as known"
-            if before > WEAK_SHARE * prior
+            if before > WEAK_SHARE * prior or alike > WORTH * before
             else "record for longer, or measure it by other means"
         )
         sentence = (

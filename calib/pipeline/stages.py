@@ -479,7 +479,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     No search follows: nothing but noise is left to explain. ``searched`` is the result of an earlier one.
     """
     from deal_hw.calib.validation.candidates import law_candidates, ranked
-    from deal_hw.calib.validation.checks import hold_shifts
+    from deal_hw.calib.validation.checks import hold_alike
     from deal_hw.calib.validation.explain import explained, rivals
 
     tried = [one for one in run.tried if run.takes(one.explanation)]
@@ -504,15 +504,18 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     (best, fit), *others = sorted(exact, key=lambda pair: pair[0].change)
     wide = dataclasses.replace(run, problem=best.problem, progress=None)
     do = best.explanation.taken.replace("{}", listed(best.added))
-    names, shifts = [one.explanation.name for one, _ in others], [best.shift_to(one) for one, _ in others]
+    names = [one.explanation.name for one, _ in others]
     if others:
         do += f" Recordings like these do not tell it from {listed(names)}."
     alarm = dataclasses.replace(best.diagnosis, do=do)
     run.say(BEFORE_SEARCH, str(alarm))
     rows = law_candidates(run.tried, found, best.explanation.name, names)
     outcome = conclude_fit(wide, searched, fit)
-    known = hold_shifts(best.problem, outcome.known, outcome.latency_s, shifts)
-    return dataclasses.replace(outcome, known=known).with_alarms(
+    if others:
+        shifts = [best.shift_to(one) for one, _ in others]
+        known, added = hold_alike(best.problem, outcome.known, outcome.latency_s, shifts)
+        outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
+    return outcome.with_alarms(
         alarm,
         diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, _ in others))],
         candidates=[row.to_json() for row in ranked(rows)],

@@ -134,13 +134,22 @@ def hold_windows(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertai
         moved = space.to_scale(other.theta) - space.to_scale(known.theta)
         square = np.append(moved, other.latency_s - latency_s) ** 2
         excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
-    return hold_shifts(problem, known, latency_s, [excess])
+    excess[:-1][known.blind] = 0.0
+    wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
+    if reach_s := known.latency_reach_s(latency_s):
+        wider = wider.latency_widened_to(reach_s + excess[-1], latency_s, problem.latency_range_s)
+    return wider
 
 
-def hold_shifts(
+def hold_alike(
     problem: Problem, known: Uncertainty, latency_s: float, shifts: Sequence[FloatArray]
-) -> Uncertainty:
+) -> tuple[Uncertainty, dict[str, float]]:
     """Return ``known`` with intervals that hold what other models say that predict as well.
+
+    Each of the models is as likely. So their values are spread around the estimate by the mean of s s^T, with
+    the shift s of each, 0 for the estimate's own. Values that only go up and down together do so in the
+    covariance, too: drawn robots then move alike. Recordings like these do not take that away, so the
+    standard deviations that it adds are returned, too, in each parameter's own scale.
 
     Args:
         problem: The problem.
@@ -148,14 +157,13 @@ def hold_shifts(
         latency_s: Its latency [s].
         shifts: Where each of the others puts the values, in their scales, and the latency [s], (K + 1,).
     """
-    if not shifts:
-        return known
-    most = np.max(np.abs(shifts), axis=0)
-    most[:-1][known.blind] = 0.0
-    wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + most[:-1] / Z90)
+    every = np.array(shifts) * np.append(~known.blind, True)
+    spread, most = every.T @ every / (len(every) + 1), np.max(np.abs(every), axis=0)
+    wider = known.with_covariance(known.covariance + spread[:-1, :-1]).widened_to(most[:-1] / Z90)
+    added = np.sqrt(np.maximum(np.diag(wider.covariance) - np.diag(known.covariance), 0.0))
     if reach_s := known.latency_reach_s(latency_s):
         wider = wider.latency_widened_to(reach_s + most[-1], latency_s, problem.latency_range_s)
-    return wider
+    return wider, dict(zip(known.space.names, map(float, added), strict=True))
 
 
 def _chi2_as(fit: Refined, other: Refined) -> float:

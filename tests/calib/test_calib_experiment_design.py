@@ -371,6 +371,24 @@ def test_an_interval_that_model_error_widened_shrinks_as_if_it_were_noise(servo:
     assert set(advice) == {"slide.damping", "slide.effort_limit"}
 
 
+def test_what_predicts_alike_stays_whatever_is_recorded(servo: RobotModel) -> None:
+    """Two masses explain as much, 50 % apart: a promise keeps that part, and is none where it is most."""
+    parameters = space("mass", "damping", "effort_limit")
+    alike = {"slide.mass": 0.0, "slide.damping": 0.5, "slide.effort_limit": 0.2}
+    found = result(parameters, np.array([0.02, 0.51, 0.6]))
+    told = dataclasses.replace(found, provenance={"alike_std": alike})
+    recorded = seen(0.02, 0.1, 2.0)
+    plain, kept = (
+        {one.parameter: one for one in advise(servo, of, recorded, seconds=1.6, threads=1)}
+        for of in (found, told)
+    )
+    limit = kept["slide.effort_limit"]
+    own = plain["slide.effort_limit"].after / 0.6 * np.sqrt(0.6**2 - 0.2**2)
+    assert limit.after == pytest.approx(np.hypot(own, 0.2), rel=1e-3) and limit.excitation
+    assert plain["slide.damping"].excitation and not kept["slide.damping"].excitation
+    assert "measure it by other means" in kept["slide.damping"].sentence
+
+
 def test_advice_says_where_no_excitation_helps(servo: RobotModel) -> None:
     """No motion separates mass and armature of one slide; a calibrated robot needs nothing."""
     parameters = space("mass", "armature")
