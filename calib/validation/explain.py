@@ -127,7 +127,7 @@ class Explained:
         space, K = self.problem.space, len(self.problem.space) - len(self.added)
         at = self.theta.copy()
         at[:K] = other.theta[:K]
-        for k, p in enumerate(space.parameters[K:], K):
+        for k, p in enumerate(space.free[K:], K):
             at[k] = at[k] if p.kind in SHAPES else off_value(p)
         return np.append(space.to_scale(at) - space.to_scale(self.theta), other.latency_s - self.latency_s)
 

@@ -32,7 +32,7 @@ from deal_hw.calib.validation.explain import (
 from deal_hw.calib.validation.explanations import off_value, one_sided, other_masses, tried_value
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.findings import Finding
-from deal_hw.parameters import Parameter
+from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.testing.plain_robots import make_robot
 
 UPPER, FORE = "another mass of upper", "another mass of fore"
@@ -80,9 +80,14 @@ def _explained(problem: Problem, body: str, deviance: float, own: float, mass: f
 
 
 def test_the_other_body_is_where_the_values_go_if_it_is_true(tmp_path: Path) -> None:
-    """1.5 times all other values and the lower link's mass, or 1/1.5 of the upper one's: the same motion."""
+    """1.5 times all other values and the lower link's mass, or 1/1.5 of the upper one's: the same motion.
+
+    A value that is known, and so not searched, is none of them.
+    """
     problem = problem_of(make_robot("double-pendulum", 3), tmp_path)
-    K = len(problem.space)
+    first, *others = problem.space.parameters
+    problem = problem.with_space(ParameterSpace([dataclasses.replace(first, known=True), *others]))
+    K = len(others)
     fore = _explained(problem, "fore", 100.0, 1.5, 0.45)
     upper = dataclasses.replace(_explained(problem, "upper", 90.0, 1.0, 0.5 / 1.5), latency_s=0.012)
     assert upper.change == pytest.approx(0.0)
