@@ -170,8 +170,8 @@ def try_explanations(
     Play is always fitted: its effect around a fit without it says little, as nothing moves within it. So is a
     lag: its linearised effect is that of a delay, which the fit has. Around a poor fit the effect says little
     of all of them, so only play is fitted then, and what is 0 in the model: the simplest reason. Each body's
-    mass is screened beside the laws. Where one leaves only noise, all that gain are fitted: in a fit without
-    it ranges may hide that another one does so, too.
+    mass is screened beside the laws. Where one leaves only noise, all are fitted: around a fit without it the
+    ends of ranges may hide that another one does so, too.
 
     Args:
         problem: The problem.
@@ -198,7 +198,7 @@ def try_explanations(
         wide = fit_wider(problem, more) if fitted else None
         found.append(Tried(each, problem, gains[each], wide))
         if each in masses and wide is not None and wide.prediction.chi2 < MISMATCH_CHI2:
-            enough = EVIDENCE
+            enough = -np.inf
     return tuple(found)
 
 
