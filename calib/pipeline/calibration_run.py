@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.refinement import Refined
     from deal_hw.calib.validation.explain import Tried
     from deal_hw.calib.validation.explanations import Explanation
+    from deal_hw.calib.validation.shared_errors import SharedErrorCheck
 
 SHARED_ERRORS = "errors that commands and measurements share"
 EXPLANATIONS = "laws that the model lacks"
@@ -83,6 +84,7 @@ class CalibrationRun:
         checks: Physics steps of each check so far, by its name.
         left_out: Why checks were left out, by their names.
         inexact: Names of laws whose exact fit to all recordings left more than noise.
+        shared: What was found of errors that commands and measurements share, once it was looked for.
     """
 
     problem: Problem
@@ -97,6 +99,7 @@ class CalibrationRun:
     checks: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     inexact: set[str] = field(default_factory=set)
+    shared: list[SharedErrorCheck] = field(default_factory=list)
     _begun: list[int] = field(default_factory=list)
 
     @contextlib.contextmanager

@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.explain import Explained
     from deal_hw.calib.validation.random_delay import DelayFit
+    from deal_hw.calib.validation.shared_errors import SharedErrorCheck
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -489,22 +490,24 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         found = explained(run.problem, run.local, tried)
     if not found or not found[0].explains:
         return None
-    exact: list[tuple[Explained, Refined]] = []
+    if searched is None and found[0].diagnosis.code == "mass" and shared_error(run).found is not None:
+        # A clock that runs fast looks like a light link, too, and is the worse fault: that comes first.
+        return None
+    exact: list[tuple[Explained, Refined, CalibrationRun]] = []
     for one in rivals([one for one in found if one.explains]):
         name, wide = one.explanation.name, dataclasses.replace(run, problem=one.problem, progress=None)
         run.say("fit", f"{name} on all recordings")
         fit = refined_from(wide, one.theta, one.latency_s)
         if conclusive(one.problem, fit):
-            exact.append((dataclasses.replace(one, theta=fit.theta, latency_s=fit.latency_s), fit))
+            exact.append((dataclasses.replace(one, theta=fit.theta, latency_s=fit.latency_s), fit, wide))
         else:
             run.inexact.add(name)
     if not exact:
         return None
     # The model's own values are somebody's best guess, so of those that explain alike the nearest is taken.
-    (best, fit), *others = sorted(exact, key=lambda pair: pair[0].change)
-    wide = dataclasses.replace(run, problem=best.problem, progress=None)
+    (best, fit, wide), *others = sorted(exact, key=lambda each: each[0].change)
     do = best.explanation.taken.replace("{}", listed(best.added))
-    names = [one.explanation.name for one, _ in others]
+    names = [one.explanation.name for one, *_ in others]
     if others:
         do += f" Recordings like these do not tell it from {listed(names)}."
     alarm = dataclasses.replace(best.diagnosis, do=do)
@@ -512,12 +515,12 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     rows = law_candidates(run.tried, found, best.explanation.name, names)
     outcome = conclude_fit(wide, searched, fit)
     if others:
-        shifts = [best.shift_to(one) for one, _ in others]
+        shifts = [best.shift_to(one) for one, *_ in others]
         known, added = hold_alike(best.problem, outcome.known, outcome.latency_s, shifts)
         outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
     return outcome.with_alarms(
         alarm,
-        diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, _ in others))],
+        diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, *_ in others))],
         candidates=[row.to_json() for row in ranked(rows)],
     )
 
@@ -530,16 +533,12 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     If it does, the recordings are right: the suspicion is withdrawn, and the whole strategy follows.
     """
     from deal_hw.calib.validation.checks import unexplained
-    from deal_hw.calib.validation.shared_errors import find_shared_error
 
-    problem, local = run.problem, run.local
+    local = run.local
     asked = run.settings.diagnosis and run.settings.local_first
     if not asked or (local is not None and not unexplained(local, WHITE_SAMPLES)):
         return fits.best(run)
-    # The search that follows is a part of the fits.
-    most = math.inf if run.settings.thorough else run.check_steps_left + run.search_steps
-    with run.check(SHARED_ERRORS):
-        checked = find_shared_error(problem, local, partial(run.say, SHARED_ERRORS, ""), most)
+    checked = shared_error(run)
     suspect = checked.found
     if suspect is None:
         found = fits.best(run)
@@ -556,6 +555,19 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         return found.with_alarms(suspect.alarm, shared_error=suspect.to_json(), candidates=rows)
     run.say(BEFORE_SEARCH, suspect.withdrawn)
     return fits.best(run)
+
+
+def shared_error(run: CalibrationRun) -> SharedErrorCheck:
+    """Return what was found of errors that commands and measurements share; it is looked for once."""
+    from deal_hw.calib.validation.shared_errors import find_shared_error
+
+    if not run.shared:
+        # The search that follows is a part of the fits.
+        most = math.inf if run.settings.thorough else run.check_steps_left + run.search_steps
+        with run.check(SHARED_ERRORS):
+            say = partial(run.say, SHARED_ERRORS, "")
+            run.shared.append(find_shared_error(run.problem, run.local, say, most))
+    return run.shared[0]
 
 
 def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:

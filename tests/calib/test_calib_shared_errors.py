@@ -188,7 +188,10 @@ def test_a_shared_error_is_named(fault: SharedFault, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
-    """A pendulum whose clock ran twice as fast: reported before the search, the first alarm, the verdict."""
+    """A pendulum whose clock ran twice as fast: reported before the search, the first alarm, the verdict.
+
+    Another mass would explain that, too, and is not taken.
+    """
     wrong = problem("pendulum", "fast-clock", tmp_path, 2.0)
     printed: list[Progress] = []
     result = calibrate_episodes(
@@ -206,6 +209,7 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
     )
     assert any("the clock were 2 times too fast" in p.message for p in printed)
     verdict = trust(result)
+    assert result.space.names == wrong.space.names
     assert verdict.colour == "red" and "Multiply all times by 0.5" in verdict.do
     assert result.provenance["shared_error"]["errors"][0]["kind"] == "clock"
 
