@@ -274,7 +274,7 @@ def test_corrections_that_take_longer_than_the_fits_are_left_out_and_said(
     monkeypatch.setattr(shared_errors_module, "find_shared_error", check)
     with_shared_error(AsGiven(), run)
     assert "3 of 5 corrections were not tried" in run.left_out[SHARED_ERRORS]
-    thorough = dataclasses.replace(run, settings=Validation(thorough=True), left_out={})
+    thorough = dataclasses.replace(run, settings=Validation(thorough=True), left_out={}, shared=[])
     with_shared_error(AsGiven(), thorough)
     assert thorough.left_out == {}
     search = 20 * 4 * sum(e.steps for e in run.problem.episodes)  # individuals x generations x steps
