@@ -176,10 +176,6 @@ class OutputErrorFits(Fits):
         fits = dataclasses.replace(self, first=(short, *windows), given=searched)
         return fits.best(dataclasses.replace(run, local=refined))
 
-    def tries_laws(self, run: CalibrationRun) -> bool:
-        """Return whether the cross-validation has candidates with laws."""
-        return run.settings.cross_validation
-
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
         from deal_hw.calib.pipeline.law_choice import (
@@ -211,9 +207,8 @@ class OutputErrorFits(Fits):
         decided = LawfulChoice(Choice("long", {}, settings.long_s, note="without folds"))
         screened, lengths = ScreenedLaws(), (windows[0].recipe.seconds, settings.long_s)
         if run.settings.cross_validation:
-            if self.tries_laws(run):
-                own = problem.space.nominal, problem.first_latency_s
-                screened = screened_laws(run, problem, [windows[0].member, own], lengths)
+            own = problem.space.nominal, problem.first_latency_s
+            screened = screened_laws(run, problem, [windows[0].member, own], lengths)
             decided = self._choose(run, problem, seed, (first, *windows), screened.chosen, search=better)
         laws = take_laws(run, problem, (screened, decided), partial(self._with_laws, run), lengths)
         choice = laws.made
@@ -248,7 +243,7 @@ class OutputErrorFits(Fits):
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
                 if judged[1] is not None and checks.unexplained(judged[1]):
                     allows: Allows = run.allows
-                    if self.tries_laws(run):
+                    if run.settings.cross_validation:
                         # The cross-validation has judged laws already.
                         allows = refused(allows, [law.name for law in EXPLANATIONS if run.takes(law)])
                     found = diagnose(judged[0], judged[1], run.tried, allows)

@@ -90,10 +90,6 @@ class Fits(abc.ABC):
         """
         return self
 
-    def tries_laws(self, run: CalibrationRun) -> bool:
-        """Return whether fits with laws that the model lacks are among the candidates."""
-        return False
-
     @abc.abstractmethod
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit, choose, and estimate the uncertainty."""

@@ -32,6 +32,7 @@ from deal_hw.calib.validation.explain import (
     Allows,
     Tried,
     explained,
+    fits_wider_models,
     keeps_mass,
     likeliest,
     try_explanations,
@@ -135,8 +136,7 @@ def weighs(
     body = next(p for p in masses(problem) if p.elements[0] == cause.subject[0])
     wide = next((one.wider for one in tried if one.wider is not None and one.wider.more == [body]), None)
     if wide is None:
-        fixed = problem.robot.base is None and not problem.noise_free
-        if not (fixed and allows(MASS, wider_cost(problem, True, 1))):
+        if not (fits_wider_models(problem) and allows(MASS, wider_cost(problem, True, 1))):
             return True
         wide = fit_wider(problem, [body])
     return wide is not None and keeps_mass(body, wide.found[0]) and gain_of(wide, refined) is not None

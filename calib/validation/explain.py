@@ -143,16 +143,21 @@ def refused(allows: Allows, names: Sequence[str]) -> Allows:
     return lambda name, steps: name not in names and allows(name, steps)
 
 
+def fits_wider_models(problem: Problem) -> bool:
+    """Return whether models with more parameters are fitted: for fixed bases, with noise."""
+    return problem.robot.base is None and not problem.noise_free
+
+
 def applicable(problem: Problem) -> dict[Explanation, list[Parameter]]:
-    """Return the explanations that a robot can have, with their parameters: for fixed bases, with noise."""
-    if problem.robot.base is not None or problem.noise_free:
+    """Return the explanations that a robot can have, with their parameters."""
+    if not fits_wider_models(problem):
         return {}
     return {each: more for each in EXPLANATIONS if (more := each.parameters(problem))}
 
 
 def of_masses(problem: Problem) -> dict[Explanation, list[Parameter]]:
-    """Return another mass of each body with its parameter: for fixed bases, with noise."""
-    if problem.robot.base is not None or problem.noise_free:
+    """Return another mass of each body, with its parameter."""
+    if not fits_wider_models(problem):
         return {}
     return {each: each.parameters(problem) for each in other_masses(problem)}
 
