@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -147,6 +149,24 @@ class CalibrationRun:
             return True
         self.left_out[name] = "left out, since it would take longer than the fits"
         return False
+
+    def shared_error(self) -> SharedErrorCheck:
+        """Return what was found of errors that commands and measurements share; it is looked for once."""
+        from deal_hw.calib.validation.shared_errors import find_shared_error
+
+        if not self.shared:
+            # The search that follows is a part of the fits.
+            most = math.inf if self.settings.thorough else self.check_steps_left + self.search_steps
+            with self.check(SHARED_ERRORS):
+                tell = partial(self.say, SHARED_ERRORS, "")
+                self.shared.append(find_shared_error(self.problem, self.local, tell, most))
+        return self.shared[0]
+
+    def note_untried(self, checked: SharedErrorCheck) -> None:
+        """Note the shared errors for which no steps were left."""
+        if checked.found is None and checked.tried < checked.of:
+            left = f"{checked.of - checked.tried} of {checked.of} corrections were not tried"
+            self.left_out[SHARED_ERRORS] = f"{left}: they would take longer than the fits"
 
     def say(self, stage: str, message: str = "", done: int = 0, total: int = 1, **candidate: Any) -> None:
         """Report a stage that begins, how far it is, or, as fields of `Progress`, a candidate estimate."""

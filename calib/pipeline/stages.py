@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import math
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -39,7 +38,6 @@ from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import (
     AFTER_FIT,
     EXPLANATIONS,
-    SHARED_ERRORS,
     CalibrationRun,
     FitOutcome,
 )
@@ -55,7 +53,7 @@ from deal_hw.calib.pipeline.minima import (
     refined_search,
 )
 from deal_hw.calib.pipeline.own_zeros import with_own_zeros
-from deal_hw.calib.pipeline.wider_ranges import grown_ranges, with_wider_ranges
+from deal_hw.calib.pipeline.wider_ranges import grown_ranges, with_doubted_recordings, with_wider_ranges
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import (
     BEFORE_SEARCH,
@@ -75,7 +73,6 @@ if TYPE_CHECKING:
     from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.explain import Explained
     from deal_hw.calib.validation.random_delay import DelayFit
-    from deal_hw.calib.validation.shared_errors import SharedErrorCheck
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -158,7 +155,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         local = local_fit(problem, offer) if self.settings.local_first else None
         if local is None and self.settings.local_first:
             run.say(BEFORE_SEARCH, DIVERGED)
-        given = problem
+        given, narrow = problem, local
         if local is not None:
             run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
         problem = run.problem
@@ -178,7 +175,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             run, local = zeros.run, zeros.fit
             white = True
         if local is not None and white:
-            found = conclude_fit(run, None, local)
+            found = with_doubted_recordings(run, given, narrow, conclude_fit(run, None, local))
         elif local is not None and (weighted := weight_channels(problem, local)) is not None:
             found = conclude_weighted(run, weighted)
         else:
@@ -486,7 +483,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         found = explained(run.problem, run.local, tried)
     if not found or not found[0].explains:
         return None
-    if searched is None and found[0].diagnosis.code == "mass" and shared_error(run).found is not None:
+    if searched is None and found[0].diagnosis.code == "mass" and run.shared_error().found is not None:
         # A clock that runs fast looks like a light link, too, and is the worse fault: that comes first.
         return None
     exact: list[tuple[Explained, Refined, CalibrationRun]] = []
@@ -534,15 +531,11 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     asked = run.settings.diagnosis and run.settings.local_first
     if not asked or (local is not None and not unexplained(local, WHITE_SAMPLES)):
         return fits.best(run)
-    checked = shared_error(run)
+    checked = run.shared_error()
     suspect = checked.found
     if suspect is None:
-        found = fits.best(run)
-        if checked.tried == checked.of:
-            return found
-        left = f"{checked.of - checked.tried} of {checked.of} corrections were not tried"
-        run.left_out[SHARED_ERRORS] = f"{left}: they would take longer than the fits"
-        return found
+        run.note_untried(checked)
+        return fits.best(run)
     run.say(BEFORE_SEARCH, str(suspect.alarm))
     unchecked = Validation(split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
@@ -551,19 +544,6 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         return found.with_alarms(suspect.alarm, shared_error=suspect.to_json(), candidates=rows)
     run.say(BEFORE_SEARCH, suspect.withdrawn)
     return fits.best(run)
-
-
-def shared_error(run: CalibrationRun) -> SharedErrorCheck:
-    """Return what was found of errors that commands and measurements share; it is looked for once."""
-    from deal_hw.calib.validation.shared_errors import find_shared_error
-
-    if not run.shared:
-        # The search that follows is a part of the fits.
-        most = math.inf if run.settings.thorough else run.check_steps_left + run.search_steps
-        with run.check(SHARED_ERRORS):
-            say = partial(run.say, SHARED_ERRORS, "")
-            run.shared.append(find_shared_error(run.problem, run.local, say, most))
-    return run.shared[0]
 
 
 def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:

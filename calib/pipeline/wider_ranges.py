@@ -8,12 +8,12 @@ of a drive adds to a delay, and both can be later than any delay alone.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import latency_end, pressed_ends, wider_latency
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.minima import clearly_lower
 from deal_hw.calibration import BEFORE_SEARCH, LATENCY, listed
 from deal_hw.parameters import ParameterSpace
@@ -79,15 +79,59 @@ def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[
             break
         run, fit = dataclasses.replace(run, problem=problem), found
     if grown := grown_ranges(given, run.problem.space, run.problem.latency_range_s):
-        units = {p.name: p.unit for p in given.space} | {LATENCY: "s"}
-        ranges = [
-            f"{name} {low:.3g} to {high:.3g} {units[name]}".rstrip() for name, (low, high) in grown.items()
-        ]
-        options = ["--latency-range LOW HIGH"] if LATENCY in grown else []
-        options += ["--range NAME LOW HIGH"] if len(grown) > len(options) else []
+        ranges = [f"{name} {_text(given, name, *ends)}" for name, ends in grown.items()]
         run.say(
             BEFORE_SEARCH,
             "the recordings press against the ends of usual ranges, and beyond them the fit is better. New "
-            f"ranges: {listed(ranges)}. If such values are impossible, give a range ({', '.join(options)})",
+            f"ranges: {listed(ranges)}. If such values are impossible, give a range ({_options(grown)})",
         )
     return run, fit
+
+
+def _text(problem: Problem, name: str, low: float, high: float) -> str:
+    """Return a range of a parameter, or of the latency, with its unit."""
+    units = {p.name: p.unit for p in problem.space} | {LATENCY: "s"}
+    return f"{low:.3g} to {high:.3g} {units[name]}".rstrip()
+
+
+def _options(names: Collection[str]) -> str:
+    """Return the options that give the ranges of parameters, and of the latency."""
+    options = ["--latency-range LOW HIGH"] if LATENCY in names else []
+    return ", ".join(options + (["--range NAME LOW HIGH"] if len(names) > len(options) else []))
+
+
+def with_doubted_recordings(
+    run: CalibrationRun, given: Problem, narrow: Refined | None, found: FitOutcome
+) -> FitOutcome:
+    """Return a fit that explains the recordings, with an alarm if these may be wrong instead.
+
+    Values beyond the usual ranges can make up for a wrong clock or unit. Where undoing such an error explains
+    the recordings in the usual ranges, both explanations are named.
+
+    Args:
+        run: The calibration.
+        given: Its problem with the usual ranges.
+        narrow: The fit in them; None where simulations diverged.
+        found: The fit that explains the recordings.
+    """
+    grown = grown_ranges(given, run.problem.space, run.problem.latency_range_s)
+    if not (grown and run.settings.diagnosis):
+        return found
+    usual = dataclasses.replace(run, problem=given, local=narrow, shared=[])
+    checked = usual.shared_error()
+    if (suspect := checked.found) is None:
+        run.note_untried(checked)
+        return found
+    space = run.problem.space
+    values = dict(zip(space.names, map(float, found.theta), strict=True)) | {LATENCY: found.latency_s}
+    ranges = {p.name: (p.low, p.high) for p in given.space} | {LATENCY: given.latency_range_s}
+    beyond = [f"{name} = {values[name]:.3g} (usual: {_text(given, name, *ranges[name])})" for name in grown]
+    alarm = dataclasses.replace(
+        suspect.alarm,
+        means=f"Or they are right, and these values are beyond their usual ranges: {listed(beyond)}. "
+        "The recordings do not tell which.",
+        do=f"{suspect.alarm.do} If they are right, give the ranges yourself ({_options(grown)}).",
+    )
+    run.say(BEFORE_SEARCH, str(alarm))
+    rows = [suspect.candidate.to_json(), *found.facts.get("candidates", ())]
+    return found.with_alarms(alarm, shared_error=suspect.to_json(), candidates=rows)

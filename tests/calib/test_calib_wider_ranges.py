@@ -16,6 +16,7 @@ from deal_hw.calib.fit.refinement import Refined, local_fit
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.methods import make_method
 from deal_hw.calib.pipeline.wider_ranges import MOST, pressed, with_wider_ranges
+from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget, Progress
@@ -140,6 +141,39 @@ def test_calibrate_finds_a_latency_beyond_the_usual_range(files: dict[str, Path]
     assert found.result.provenance["grown_ranges"]["latency"] == [0.0, 0.08]
     assert any("latency 0 to 0.08 s" in text and "--latency-range LOW HIGH" in text for text in said)
     assert [str(a) for a in found.result.alarms if "The latency ended" in a.seen] == []
+
+
+@pytest.fixture(scope="module")
+def fast_clock(files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same arm under its right model, in a recording whose times were doubled."""
+    folder = tmp_path_factory.mktemp("fast")
+    with np.load(files["data"]) as noted:
+        columns = dict(noted)
+    np.savez(folder / "fast.npz", **columns | {"time": 2 * columns["time"]})
+    (folder / "arm.xml").write_text(ARM.format(damping=TRUE_DAMPING))
+    return files | {"data": folder / "fast.npz", "model": folder / "arm.xml"}
+
+
+def test_a_wrong_clock_is_named_beside_values_beyond_the_usual_ranges(fast_clock: dict[str, Path]) -> None:
+    """Twice the time looks like four times the inertia: both are named, and the verdict is red."""
+    said: list[str] = []
+    found = deal_hw.calibrate(**fast_clock, threads=1, say=said.append)
+    result = found.result
+    # (0.024 of the rod + 0.02) * 4 - 0.024: twice the time is a quarter of the acceleration.
+    assert result.space["shoulder.armature"].high == pytest.approx(0.02 * 25)
+    assert result.estimate[result.space.names.index("shoulder.armature")] == pytest.approx(0.152, rel=0.03)
+    assert result.provenance["shared_error"]["errors"][0]["kind"] == "clock"
+    verdict = trust(result)
+    assert verdict.colour == "red" and "the clock were 2 times too fast" in verdict.seen
+    assert "shoulder.armature = 0.15" in verdict.means and "usual: 0.004 to 0.1 kg·m²" in verdict.means
+    assert "--range NAME LOW HIGH" in verdict.do
+    assert any("If they are right, give the ranges yourself" in text for text in said)
+
+
+def test_a_range_that_somebody_gave_is_no_sign_of_a_wrong_clock(fast_clock: dict[str, Path]) -> None:
+    """The advice of that alarm ends it."""
+    found = deal_hw.calibrate(**fast_clock, threads=1, range=(("shoulder.armature", 0.004, 0.5),))
+    assert "shared_error" not in found.result.provenance and trust(found.result).colour != "red"
 
 
 @pytest.mark.parametrize("given", [{"latency_range": (0.0, 0.05)}, {"latency": 0.01}])
