@@ -155,8 +155,9 @@ class CalibrationRun:
         from deal_hw.calib.validation.shared_errors import find_shared_error
 
         if not self.shared:
-            # The search that follows is a part of the fits.
-            most = math.inf if self.settings.thorough else self.check_steps_left + self.search_steps
+            # A wrong recording is worse than a law that is missing, so the laws that were tried take none of
+            # these steps. The search that follows is a part of the fits.
+            most = math.inf if self.settings.thorough else self.fit_steps + self.search_steps
             with self.check(SHARED_ERRORS):
                 tell = partial(self.say, SHARED_ERRORS, "")
                 self.shared.append(find_shared_error(self.problem, self.local, tell, most))
