@@ -123,7 +123,7 @@ def predict_population(
     # Only windows and their start states are sent.
     nothing = np.empty((0, 0, 0))
     sent = dataclasses.replace(
-        data, measured=nothing, std=nothing, prior_mean=nothing, prior_std=nothing, late=None
+        data, measured=nothing, std=nothing, prior_mean=nothing, prior_std=nothing, late=None, by_delay=None
     )
     if position is not None and velocity is not None:
         sent = dataclasses.replace(sent, start_position=position, start_velocity=velocity)

@@ -33,9 +33,9 @@ def taken(data: WindowData, chosen: npt.NDArray[Any]) -> WindowData:
     """Return the windows under a mask (W,), or at these rows."""
     names = ("measured", "std", "start_position", "start_velocity", "prior_mean", "prior_std")
     windows = dataclasses.replace(data.windows, start=data.windows.start[chosen])
-    late = None if data.late is None else data.late[chosen]
+    late, by_delay = (None if each is None else each[chosen] for each in (data.late, data.by_delay))
     values = {name: getattr(data, name)[chosen] for name in names}
-    return dataclasses.replace(data, windows=windows, late=late, **values)
+    return dataclasses.replace(data, windows=windows, late=late, by_delay=by_delay, **values)
 
 
 def measurements(windows: Sequence[WindowData]) -> int:

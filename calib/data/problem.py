@@ -77,6 +77,8 @@ class WindowData:
         prior_counts: Entries of the prior that count as measurements, (2 C,).
         late: Directions in which random delays of commands move whitened predictions, scaled, (W, H M, P);
             None for constant delays.
+        by_delay: Changes of the whitened predictions by the delay of each command, (W, H M, P) [1/s]; None
+            for constant delays.
     """
 
     episode: int
@@ -89,6 +91,7 @@ class WindowData:
     prior_std: FloatArray
     prior_counts: Mask
     late: FloatArray | None = None
+    by_delay: FloatArray | None = None
 
     def whitened(self, error: FloatArray) -> FloatArray:
         """Return prediction errors or their changes, (..., W, H, M), in units of their standard deviation.

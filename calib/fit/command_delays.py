@@ -58,7 +58,7 @@ def with_command_delays(problem: Problem, windows: Sequence[WindowData]) -> list
         root, size, _ = np.linalg.svd(known.std_s * columns, full_matrices=False)
         late = root * np.sqrt(1.0 - 1.0 / np.sqrt(1.0 + size**2))[:, None]
         measured = data.measured + std * moved.reshape(data.measured.shape)
-        found.append(dataclasses.replace(data, measured=measured, late=late))
+        found.append(dataclasses.replace(data, measured=measured, late=late, by_delay=columns))
     return found
 
 
@@ -72,9 +72,8 @@ def delay_columns(
     """
     episode = problem.episodes[data.episode]
     begins = command_begins(episode)
-    count = _in_window(episode.sample[data.windows.start], data.windows.length * data.windows.stride, begins)
-    P = min(count + EARLIER_COMMANDS, len(begins))
-    if not count or P > MOST_COMMANDS:
+    P = commands_of(problem, data)
+    if not 0 < P <= MOST_COMMANDS:
         return None
     targets = np.repeat(episode.target[None], 1 + P, axis=0)
     for k in range(P):
@@ -86,6 +85,14 @@ def delay_columns(
     observed = problem.predict_along(batch, path, data).observed
     change = np.nan_to_num((observed[1:] - observed[:1]) / data.std, nan=0.0, posinf=0.0, neginf=0.0)
     return np.asarray(np.moveaxis(change, 0, -1).reshape(len(data.windows), -1, P) / episode.step_s)
+
+
+def commands_of(problem: Problem, data: WindowData) -> int:
+    """Return the number of commands that count in one window of an episode; 0 where none begins in any."""
+    begins = command_begins(problem.episodes[data.episode])
+    start = problem.episodes[data.episode].sample[data.windows.start]
+    count = _in_window(start, data.windows.length * data.windows.stride, begins)
+    return min(count + EARLIER_COMMANDS, len(begins)) if count else 0
 
 
 def command_begins(episode: SampledEpisode) -> IntArray:

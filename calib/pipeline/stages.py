@@ -189,7 +189,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 with run.check(EXPLANATIONS):
                     tried = try_explanations(problem, with_rows(local), run.may_try, say=run.ask)
                 run = dataclasses.replace(run, tried=tried)
-            found = with_explanation(run) or with_shared_error(fits, run)
+            found = with_explanation(run) or with_random_delays(run) or with_shared_error(fits, run)
         found = found if zeros is None else zeros.said(found)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
@@ -364,23 +364,24 @@ def conclude_fit(
     restarts: int = 0,
     *,
     wrong: bool = False,
+    late: DelayFit | None = None,
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
     ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
-    not explain the recordings, although the residual is as large as the weights say.
+    not explain the recordings, although the residual is as large as the weights say. ``late`` is the fit with
+    random delays of commands, where that is known already.
     """
     from deal_hw.calib.validation.candidates import Candidate
     from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
     from deal_hw.calib.validation.random_delay import fit_delays
     from deal_hw.calib.validation.time_steps import averaged, scan_latency
 
-    late, scan, whole = None, None, None
-    searched = searched or without_search(run.problem, run.budget, refined)
-    if unexplained(refined, WHITE_SAMPLES):
-        # Not before: in another minimum delays seem to explain what no parameters there do.
+    scan, whole = None, None
+    searched = searched or without_search(run.problem, run.budget, refined if late is None else late.fit)
+    if late is None and unexplained(refined, WHITE_SAMPLES):
         late = fit_delays(run.problem, refined, EVIDENCE)
-        refined = refined if late is None else late.fit
+    refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
@@ -516,6 +517,23 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, *_ in others))],
         candidates=[row.to_json() for row in ranked(rows)],
     )
+
+
+def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
+    """Return the fit with a delay of its own for each command, if only noise is left then; otherwise None.
+
+    Far from the noise delays seem to explain what no parameters there do.
+    """
+    from deal_hw.calib.validation.explain import FAR
+    from deal_hw.calib.validation.random_delay import fit_delays
+
+    if run.local is None or run.local.chi2 > FAR:
+        return None
+    run.say("fit", "does each command act after a delay of its own?")
+    late = fit_delays(run.problem, run.local, EVIDENCE)
+    if late is None or not conclusive(late.problem, late.fit):
+        return None
+    return conclude_fit(run, None, run.local, late=late)
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from deal_hw import calibrate
 from deal_hw.bench.tasks import Case, make_case
+from deal_hw.calib.data.parts import taken
 from deal_hw.calib.data.problem import CommandDelays, Problem, WindowData
 from deal_hw.calib.data.resume import Restarts
+from deal_hw.calib.fit import command_delays as command_delays_module
 from deal_hw.calib.fit.command_delays import (
     FreeRows,
     _numbers,
     command_begins,
+    commands_of,
     delay_columns,
     free_rows,
     likely_std,
@@ -27,13 +32,15 @@ from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.random_delay import fit_delays
+from deal_hw.calib.validation import random_delay as random_delay_module
+from deal_hw.calib.validation.random_delay import _too_many, fit_delays
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import signatures
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.plant.profiles import PROFILES
 from deal_hw.parameters import Parameter
 from deal_hw.sim.recordings.episode import SampledEpisode
+from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
 
 DELAY_S = 1.1e-3
@@ -55,6 +62,30 @@ def test_whitened_errors_have_unit_covariance(noisy: Case, noisy_problem: Proble
         W = white[:, w].T
         np.testing.assert_allclose(W @ covariance @ W.T, np.eye(H * M), atol=1e-9)
     np.testing.assert_array_equal(late.measured, data.measured)
+    # A fit around these windows need not simulate the columns again; a part of the windows has its own.
+    np.testing.assert_array_equal(late.by_delay, columns)
+    np.testing.assert_array_equal(taken(late, np.array([0])).by_delay, columns[:1])
+
+
+def test_windows_have_no_columns_where_commands_are_too_many(
+    noisy: Case, noisy_problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each command of a window counts, and eight before it; with one more than is allowed there is none."""
+    (data,) = noisy_problem.windows(40)
+    episode = noisy_problem.episodes[0]
+    begins, start = command_begins(episode), episode.sample[data.windows.start]
+    ends = start + data.windows.length * data.windows.stride
+    inside = max(int(np.sum((begins >= a) & (begins < b))) for a, b in zip(start, ends, strict=True))
+    count = commands_of(noisy_problem, data)
+    assert count == inside + 8
+    columns = delay_columns(noisy_problem, noisy.theta, noisy.latency_s, data)
+    assert columns is not None and columns.shape[2] == count
+    seconds = 40 * episode.period_s
+    assert not _too_many(noisy_problem, seconds) and not _too_many(noisy_problem, 100.0)
+    for module in (command_delays_module, random_delay_module):
+        monkeypatch.setattr(module, "MOST_COMMANDS", count - 1)
+    assert delay_columns(noisy_problem, noisy.theta, noisy.latency_s, data) is None
+    assert _too_many(noisy_problem, seconds)
 
 
 def _delayed(std_s: float, seed: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -260,3 +291,18 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     json.dumps(found.facts)
     # It is wide, and is reported to be.
     assert high - low < 20e-3 and found.facts["split_half"]["scale"] > 1.5
+
+
+@pytest.mark.slow
+def test_delays_longer_than_the_time_between_commands_are_found_without_a_search(tmp_path: Path) -> None:
+    """Commands at 200 Hz, each 0 to 22 ms late, so many wait for those before them: chi2 5 becomes 1."""
+    robot = make_robot("pendulum", 3, "jitter")
+    model, data, held_out = write(robot, tmp_path, seconds=6.0)
+    result = calibrate(model=model, data=data, holdout=held_out, threads=1).result
+    assert result.provenance["search"] == "local fit" and result.chi2 < 1.1
+    (row,) = (c for c in result.provenance["candidates"] if c["outcome"] == "taken")
+    assert row["explanation"] == "a delay of its own for each command"
+    assert "Each command acts after its own delay" in str(result.alarms[0])
+    truth = np.array([robot.truth[name] for name in result.space.names])
+    assert np.all((result.interval[:, 0] <= truth) & (truth <= result.interval[:, 1]))
+    assert np.mean(np.abs(result.estimate / truth - 1)) < 0.15
