@@ -20,6 +20,7 @@ from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import correlated_samples
 from deal_hw.calib.validation.cause_words import SearchedKinds
 from deal_hw.calib.validation.cross_validation import fold_numbers
+from deal_hw.calib.validation.random_delay import most_delay_std_s
 from deal_hw.calib.validation.signatures import (
     Signature,
     SignatureResponse,
@@ -62,8 +63,7 @@ class Evidence:
         time_s: Time of each sample in its recording, per episode (W, H) [s].
         names: Names of the recordings, per episode.
         searched: What the fit searched.
-        most_delay_std_s: Largest standard deviation of delays [s]: half of the longest one, as for every
-            quantity between 0 and that (Popoviciu's inequality).
+        most_delay_std_s: Largest standard deviation of delays [s].
     """
 
     rows: Sequence[WindowRows]
@@ -250,7 +250,7 @@ def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Ev
         ],
         names=names,
         searched=SearchedKinds.of(problem, refined.theta),
-        most_delay_std_s=problem.latency_range_s[1] / 2,
+        most_delay_std_s=most_delay_std_s(problem),
     )
 
 

@@ -139,8 +139,8 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
     if found is None or not found.gain > least:
         return None
     std_s, gain = _likely(part, refined, rows, columns)
-    # Commands that wait for those before them have no delay of their own.
-    if not gain > least or std_s > MOST_SPACED * command_spacing_s(problem):
+    most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
+    if not gain > least or std_s > most_s:
         return None
     delayed = _with(problem.with_command_delays(none), refined, std_s)
     best: Refined | None = None
@@ -170,6 +170,14 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
         return None
     found = replace(found, std_s=std_s * max(best.chi2, 1.0) ** 0.5)
     return DelayFit(best.shooting.problem, best, found, refined)
+
+
+def most_delay_std_s(problem: Problem) -> float:
+    """Return the largest standard deviation of delays [s]: half of the longest latency.
+
+    So it is for every quantity between 0 and that (Popoviciu's inequality).
+    """
+    return problem.latency_range_s[1] / 2
 
 
 def _too_many(problem: Problem, seconds: float) -> bool:

@@ -33,11 +33,12 @@ from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation import random_delay as random_delay_module
-from deal_hw.calib.validation.random_delay import _too_many, fit_delays
+from deal_hw.calib.validation.random_delay import RandomDelay, _too_many, fit_delays
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import signatures
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.plant.profiles import PROFILES
+from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_robots import make_robot, write
@@ -291,6 +292,30 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     json.dumps(found.facts)
     # It is wide, and is reported to be.
     assert high - low < 20e-3 and found.facts["split_half"]["scale"] > 1.5
+
+
+@pytest.mark.parametrize(("std_s", "tried"), [(0.012, True), (0.021, False)])
+def test_delays_that_vary_by_more_than_latencies_do_are_something_else(
+    std_s: float,
+    tried: bool,
+    noisy_problem: Problem,
+    noisy_refined: Refined,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Latencies up to 40 ms have at most half of that as standard deviation, however rare commands are."""
+    begun: list[Problem] = []
+
+    def refused(problem: Problem, *_: object, **__: object) -> Refined:
+        begun.append(problem)
+        raise InsufficientDataError("no window")
+
+    assert noisy_problem.latency_range_s[1] == 0.04
+    monkeypatch.setattr(random_delay_module, "random_delay", lambda *_: RandomDelay(99.0, 99.0, 0.5, std_s))
+    monkeypatch.setattr(random_delay_module, "_likely", lambda *_: (std_s, 99.0))
+    monkeypatch.setattr(random_delay_module, "command_spacing_s", lambda _: 0.1)
+    monkeypatch.setattr(random_delay_module, "refine", refused)
+    assert fit_delays(noisy_problem, noisy_refined, EVIDENCE) is None
+    assert bool(begun) is tried
 
 
 @pytest.mark.slow
