@@ -38,7 +38,7 @@ from deal_hw.calib.validation.explain import (
     try_explanations,
 )
 from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.recording_zeros import named_zeros
+from deal_hw.calib.validation.recording_zeros import MOST_ZERO, named_zeros
 from deal_hw.calib.validation.signatures import Cause, Signature, masses
 from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost
 from deal_hw.calibration import listed, percent
@@ -156,7 +156,7 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     taken: list[Signature] = []
     groups = groups_of(known.found)
     while groups and len(found) < MOST_CAUSES:
-        groups = [group for group in groups if _possible(known, taken, group)]
+        groups = [some for group in groups if (some := _possible(known, taken, group))]
         gains = [known.gain(taken, group) for group in groups]
         if not gains or max(gains) <= EVIDENCE:
             break
@@ -198,7 +198,7 @@ def unsure_shift(known: Evidence, named: Collection[str]) -> FloatArray:
         for group in groups_of(known.found)
         if group[0].cause not in named
     ]
-    groups = [group for group in groups if group and _possible(known, [], group)]
+    groups = [some for group in groups if group and (some := _possible(known, [], group))]
     gains = np.array([0.0, *(known.gain([], group) for group in groups)])
     weights = np.exp((gains - gains.max()) / 2)
     before = known.coefficients([])
@@ -235,7 +235,7 @@ def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
     Effects of masses and friction are those around the fit, which is not the robot. Play acts where the
     measured motion or load turns round, wherever the parameters are.
     """
-    groups = [group for group in groups_of(known.found) if _possible(known, [], group)]
+    groups = [some for group in groups_of(known.found) if (some := _possible(known, [], group))]
     rivals = [known.gain([], group) for group in groups if group[0].cause != "backlash"]
     for group in (group for group in groups if group[0].cause == "backlash"):
         gain = known.gain([], group)
@@ -245,9 +245,21 @@ def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
     return None
 
 
-def _possible(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> bool:
-    """Return whether a cause leaves every mass above 0."""
-    return group[0].cause != "mass" or _mass_change(known, taken, group[0]) > -1.0
+def _possible(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> list[Signature]:
+    """Return what a cause may be of a group: another mass is above 0, and no zero is off as far as one sees.
+
+    A joint whose zero hardly moves anything, as one that turns about a vertical axis, would need a huge one.
+    """
+    left = list(group)
+    if group[0].cause == "mass":
+        return left if _mass_change(known, taken, group[0]) > -1.0 else []
+    while left and left[0].cause == "zero":
+        values = np.abs(known.coefficients([*taken, *left])[-len(left) :])
+        far = {s.where for s, value in zip(left, values, strict=True) if value > MOST_ZERO}
+        if not far:
+            break
+        left = [s for s in left if s.where not in far]
+    return left
 
 
 def _mass_change(known: Evidence, taken: Sequence[Signature], body: Signature) -> float:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
+from fakes.knee_evidence import STD, knee_evidence, knee_motion, moved_by
 from fakes.sine_arm import MJCF, record
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.validation.diagnosis import name_causes
 from deal_hw.calib.validation.recording_zeros import (
     MOST_ZERO,
     named_zeros,
@@ -104,3 +108,15 @@ def test_an_alarm_has_the_zeros_of_six_recordings() -> None:
     """And says how many more there are."""
     words = named_zeros("elbow", "rad", {f"r{k}": 0.01 * k for k in range(8)})
     assert words.startswith("elbow: +0 rad in r0, +0.01 rad in r1") and words.endswith("r5, and in 2 more")
+
+
+def test_no_zero_that_one_would_see_is_named() -> None:
+    """A yaw joint about a vertical axis whose zero moves next to nothing would need 500 rad."""
+    v, a = knee_motion()
+    effects = {"knee": moved_by(np.sign(v)), "yaw": 1e-6 * moved_by(a)}
+    zeros = [Signature("zero", where, (moved[..., None] / STD,), "rad") for where, moved in effects.items()]
+    residual = -0.05 * effects["knee"] - 500 * effects["yaw"]
+    known = dataclasses.replace(knee_evidence(residual), names=["a"], found=zeros)
+    (found,) = name_causes(known)
+    assert found.code == "zero" and found.subject == ("knee",) and "knee: +0.05 rad in a" in found.seen
+    assert name_causes(dataclasses.replace(known, found=zeros[1:])) == []
