@@ -14,6 +14,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
+from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.findings import Finding
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.refinement import Refined
     from deal_hw.calib.validation.explain import Tried
     from deal_hw.calib.validation.explanations import Explanation
+    from deal_hw.calib.validation.random_delay import DelayFit
     from deal_hw.calib.validation.shared_errors import SharedErrorCheck
 
 SHARED_ERRORS = "errors that commands and measurements share"
@@ -87,6 +89,7 @@ class CalibrationRun:
         left_out: Why checks were left out, by their names.
         inexact: Names of laws whose exact fit to all recordings left more than noise.
         shared: What was found of errors that commands and measurements share, once it was looked for.
+        delays: Fits with random delays of commands so far, beside the fits that they began from.
     """
 
     problem: Problem
@@ -102,6 +105,7 @@ class CalibrationRun:
     left_out: dict[str, str] = field(default_factory=dict)
     inexact: set[str] = field(default_factory=set)
     shared: list[SharedErrorCheck] = field(default_factory=list)
+    delays: list[tuple[Refined, DelayFit | None]] = field(default_factory=list)
     _begun: list[int] = field(default_factory=list)
 
     @contextlib.contextmanager
@@ -162,6 +166,17 @@ class CalibrationRun:
                 tell = partial(self.say, SHARED_ERRORS, "")
                 self.shared.append(find_shared_error(self.problem, self.local, tell, most))
         return self.shared[0]
+
+    def random_delays(self, fit: Refined) -> DelayFit | None:
+        """Return a fit with random delays of commands, if it shows them; each fit is asked once."""
+        from deal_hw.calib.validation.random_delay import fit_delays
+
+        for before, found in self.delays:
+            same = before.shooting.problem is fit.shooting.problem
+            if same and before.chi2 == fit.chi2 and np.array_equal(before.theta, fit.theta):
+                return found
+        self.delays.append((fit, fit_delays(self.problem, fit, EVIDENCE)))
+        return self.delays[-1][1]
 
     def note_untried(self, checked: SharedErrorCheck) -> None:
         """Note the shared errors for which no steps were left."""

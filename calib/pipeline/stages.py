@@ -22,7 +22,6 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
-    EVIDENCE,
     MISMATCH_CHI2,
     WHITE_SAMPLES,
     uncertainty_at,
@@ -374,13 +373,12 @@ def conclude_fit(
     """
     from deal_hw.calib.validation.candidates import Candidate
     from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
-    from deal_hw.calib.validation.random_delay import fit_delays
     from deal_hw.calib.validation.time_steps import averaged, scan_latency
 
     scan, whole = None, None
     searched = searched or without_search(run.problem, run.budget, refined if late is None else late.fit)
     if late is None and unexplained(refined, WHITE_SAMPLES):
-        late = fit_delays(run.problem, refined, EVIDENCE)
+        late = run.random_delays(refined)
     refined = refined if late is None else late.fit
     problem = run.problem if late is None else late.problem
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
@@ -525,12 +523,11 @@ def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
     Far from the noise delays seem to explain what no parameters there do.
     """
     from deal_hw.calib.validation.explain import FAR
-    from deal_hw.calib.validation.random_delay import fit_delays
 
     if run.local is None or run.local.chi2 > FAR:
         return None
     run.say("fit", "does each command act after a delay of its own?")
-    late = fit_delays(run.problem, run.local, EVIDENCE)
+    late = run.random_delays(run.local)
     if late is None or not conclusive(late.problem, late.fit):
         return None
     return conclude_fit(run, None, run.local, late=late)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.small_runs import small_run
 
 from deal_hw import calibrate
 from deal_hw.bench.tasks import Case, make_case
@@ -316,6 +317,25 @@ def test_delays_that_vary_by_more_than_latencies_do_are_something_else(
     monkeypatch.setattr(random_delay_module, "refine", refused)
     assert fit_delays(noisy_problem, noisy_refined, EVIDENCE) is None
     assert bool(begun) is tried
+
+
+def test_a_fit_is_asked_for_delays_once(
+    noisy_problem: Problem, noisy_refined: Refined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the search and after it, if that ended where the local fit was; another fit is asked itself."""
+    asked: list[Refined] = []
+
+    def none(problem: Problem, fit: Refined, least: float) -> None:
+        assert problem is noisy_problem and least == EVIDENCE
+        asked.append(fit)
+
+    monkeypatch.setattr(random_delay_module, "fit_delays", none)
+    run = small_run(noisy_problem)
+    other = dataclasses.replace(noisy_refined, theta=1.01 * noisy_refined.theta)
+    same = dataclasses.replace(noisy_refined, theta=noisy_refined.theta.copy())
+    for fit in (noisy_refined, same, other):
+        assert dataclasses.replace(run, local=fit).random_delays(fit) is None
+    assert asked == [noisy_refined, other]
 
 
 @pytest.mark.slow
