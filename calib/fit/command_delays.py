@@ -115,6 +115,13 @@ def _numbers(problem: Problem, data: WindowData, P: int) -> IntArray:
     return np.asarray(np.maximum(last - (last - np.arange(P)) % P, -1))
 
 
+def command_times(problem: Problem, data: WindowData, P: int) -> FloatArray:
+    """Return when the command of each column of a window begins, (W, P) [s]."""
+    episode = problem.episodes[data.episode]
+    begins = command_begins(episode)
+    return np.asarray(begins[_numbers(problem, data, P)] * episode.step_s)
+
+
 def shifts(problem: Problem, data: WindowData, P: int) -> FloatArray:
     """Return by how much the command of each column was moved already, (W, P) [s]."""
     episode, known = problem.episodes[data.episode], problem.command_delays

@@ -1,10 +1,11 @@
 """Test for a random delay of each command, on the residual of a fit.
 
 Random delays predict no sample, but they predict where the residual is large: each pushes in proportion to
-the change of its command. Any other model error looks like a random force of constant size, white or slow.
-All are Gaussian processes beside white noise. Random delays are found where the residual is likelier with
-them than with these forces alone. Then the fit is repeated with a delay of its own for each command; see
-:mod:`deal_hw.calib.fit.command_delays`.
+the change of its command. Any other model error looks like a random force of constant size, white or slow, or
+like delays that change slowly: dry friction that falls with speed holds the motion back where commands turn
+round, over many of them. All are Gaussian processes beside white noise. Random delays are found where the
+residual is likelier with them than with these alone. Then the fit is repeated with a delay of its own for
+each command; see :mod:`deal_hw.calib.fit.command_delays`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from deal_hw.calib.data.problem import CommandDelays, Problem
 from deal_hw.calib.fit.command_delays import (
     MOST_COMMANDS,
     command_spacing_s,
+    command_times,
     commands_of,
     delay_columns,
     free_rows,
@@ -38,14 +40,14 @@ from deal_hw.types import FloatArray
 FEWEST_WINDOWS = 4
 """Fewest windows."""
 
-MOST_WINDOWS = 20
-"""Most windows, spread over the recordings."""
+MOST_ENTRIES = 2_000_000
+"""Most entries of the windows' covariances; with more, windows are left out, spread over the recordings."""
 
 ROWS = 320
 """Residuals of each window, from its start."""
 
 SLOW_S = 0.1
-"""Correlation time of the slow force [s]."""
+"""Correlation time of the slow force, and of delays that change slowly [s]."""
 
 VARIANCE_RATIO = (1e-5, 1e5)
 """Least and largest ratio of the mean variances of a process and the noise [-]."""
@@ -71,7 +73,8 @@ class RandomDelay:
 
     Attributes:
         deviance: Gain in deviance over white noise.
-        gain: Gain in deviance over white noise and random forces, beside these.
+        gain: Gain in deviance over white noise and random forces, beside these; 0 where delays that change
+            slowly are likelier.
         share: Share of the residual's variance.
         std_s: Standard deviation of the delays [s].
     """
@@ -135,7 +138,9 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
     if seen is None:
         return None
     rows, columns = seen
-    found = random_delay(rows, answers(part, refined), problem.episodes[0].period_s, columns)
+    times = [command_times(part, d, c.shape[2]) for d, c in zip(refined.shooting.data, columns, strict=True)]
+    period_s = problem.episodes[0].period_s
+    found = random_delay(rows, answers(part, refined), period_s, columns, times)
     if found is None or not found.gain > least:
         return None
     std_s, gain = _likely(part, refined, rows, columns)
@@ -240,29 +245,36 @@ def random_delay(
     answers: Sequence[SignatureResponse],
     period_s: float,
     columns: Sequence[FloatArray] | None = None,
+    times: Sequence[FloatArray] | None = None,
 ) -> RandomDelay | None:
-    """Compare random delays and forces with forces alone; None where there is nothing to compare.
+    """Compare random delays beside other processes with these alone; None where there is nothing to compare.
 
     Residuals and the windows' responses to commands are given per episode, and the columns of
-    :func:`delay_columns`, if they are known. Without them each sample's change of a set-point has a delay.
+    :func:`delay_columns` with the times of their commands, (W, P) [s], if they are known. Without them each
+    sample's change of a set-point has a delay.
     """
     every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
-    chosen = every[:: max(-(-len(every) // MOST_WINDOWS), 1)]
+    entries = sum(len(r.residual) * min(r.residual.shape[1], ROWS) ** 2 for r in rows)
+    chosen = every[:: max(-(-entries // MOST_ENTRIES), 1)]
     if len(chosen) < FEWEST_WINDOWS or not any(np.any(a.change) for a in answers):
         return None
     late = [None] * len(rows) if columns is None else columns
-    windows = [_Window.of(rows[e], answers[e], late[e], w) for e, w in chosen]
+    when = [None] * len(rows) if times is None else times
+    windows = [_Window.of(rows[e], answers[e], late[e], when[e], w) for e, w in chosen]
     change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])
     rms = np.sqrt(np.mean(change**2, axis=0))
     residual = np.stack([window.residual for window in windows])
     followed = np.stack([window.parameter for window in windows])
     delay, scale = _process(windows, "delay", rms, period_s)
-    forces = [_process(windows, name, rms, period_s)[0] for name in ("white", "slow")]
+    slow_delay, *forces = (
+        _process(windows, name, rms, period_s)[0] for name in ("slow delay", "white", "slow")
+    )
     noise, delays, without = (_fitted(residual, followed, these)[0] for these in ([], [delay], forces))
+    rival = _fitted(residual, followed, [*forces, slow_delay])[0]
     both, ratios, level = _fitted(residual, followed, [*forces, delay])
     return RandomDelay(
         deviance=noise - delays,
-        gain=without - both,
+        gain=without - both if both < rival else 0.0,
         share=float(ratios[-1] / (1 + ratios.sum())),
         std_s=float(np.sqrt(ratios[-1] * level / scale)),
     )
@@ -279,6 +291,7 @@ class _Window:
         response: Whitened response to a set-point, (A, H, M).
         change: Changes of the set-points, (H, A).
         late: Changes by the delay of each command, if known, (P, H M) [1/s].
+        time_s: Times of these commands, (P,) [s].
     """
 
     residual: FloatArray
@@ -287,9 +300,17 @@ class _Window:
     response: FloatArray
     change: FloatArray
     late: FloatArray | None
+    time_s: FloatArray | None
 
     @classmethod
-    def of(cls, rows: WindowRows, answer: SignatureResponse, late: FloatArray | None, w: int) -> _Window:
+    def of(
+        cls,
+        rows: WindowRows,
+        answer: SignatureResponse,
+        late: FloatArray | None,
+        time_s: FloatArray | None,
+        w: int,
+    ) -> _Window:
         R, S, M = rows.residual.shape[1], rows.start.shape[2], answer.response.shape[3]
         H = min(answer.response.shape[2], max(ROWS // M, 4))
         # The start state's prior comes last.
@@ -299,12 +320,21 @@ class _Window:
         known = None if late is None else late[w, : H * M].T
         parameter = basis.T @ rows.parameter[w][kept]
         return cls(
-            residual, parameter, basis[: H * M], answer.response[:, w, :H], answer.change[w, :H], known
+            residual=residual,
+            parameter=parameter,
+            basis=basis[: H * M],
+            response=answer.response[:, w, :H],
+            change=answer.change[w, :H],
+            late=known,
+            time_s=None if time_s is None else time_s[w],
         )
 
 
 def _process(
-    windows: Sequence[_Window], name: Literal["delay", "white", "slow"], rms: FloatArray, period_s: float
+    windows: Sequence[_Window],
+    name: Literal["delay", "slow delay", "white", "slow"],
+    rms: FloatArray,
+    period_s: float,
 ) -> tuple[FloatArray, float]:
     """Return the covariance of late commands, or of forces as large as command changes, (A,) rms.
 
@@ -314,21 +344,22 @@ def _process(
     covariance = []
     for window in windows:
         A, H, M = window.response.shape
-        if name == "delay" and window.late is not None:
-            columns = window.late @ window.basis
-            covariance.append(columns.T @ columns)
-            continue
-        later = np.zeros((A, H, H, M))
-        for k in range(H):
-            later[:, k, k:] = window.response[:, : H - k]
-        if name == "delay":
-            moved = np.einsum("ka,akhm->khm", window.change, later)
+        late = name in ("delay", "slow delay")
+        moved: FloatArray
+        time_s: FloatArray
+        if late and window.late is not None and window.time_s is not None:
+            moved, time_s = window.late[None], window.time_s
         else:
-            moved = rms[:, None, None, None] * later
-        if name == "slow":
-            apart = np.abs(np.subtract.outer(np.arange(H), np.arange(H))) * period_s
-            root = np.linalg.cholesky(np.exp(-apart / SLOW_S) + 1e-9 * np.eye(H))
-            moved = np.einsum("lk,alhm->akhm", root, moved)
+            later = np.zeros((A, H, H, M))
+            for k in range(H):
+                later[:, k, k:] = window.response[:, : H - k]
+            size = window.change.T[..., None, None] if late else rms[:, None, None, None]
+            moved = (size * later).reshape(A, H, H * M)
+            time_s = np.arange(H, dtype=np.float64) * period_s
+        if name in ("slow", "slow delay"):
+            apart = np.abs(np.subtract.outer(time_s, time_s))
+            root = np.linalg.cholesky(np.exp(-apart / SLOW_S) + 1e-9 * np.eye(len(time_s)))
+            moved = np.asarray(np.einsum("lk,alr->akr", root, moved))
         columns = moved.reshape(-1, H * M) @ window.basis
         covariance.append(columns.T @ columns)
     every = np.stack(covariance)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from fakes.knee_evidence import PERIOD_S, SAMPLES, STD, WINDOWS, knee_evidence, knee_motion, moved_by
+from fakes.knee_evidence import SAMPLES, STD, WINDOWS, knee_evidence, knee_motion, moved_by
 from fakes.plain_truth import problem_of, truth
 
 from deal_hw.calib.data.parts import part_of
@@ -25,7 +25,6 @@ from deal_hw.calib.validation.cross_validation import fold_numbers
 from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, unsure_shift, weighs
 from deal_hw.calib.validation.evidence import Evidence, evidence
 from deal_hw.calib.validation.explain import explained, try_explanations
-from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
 from deal_hw.calib.validation.residual_place import (
     Kind,
     Quantity,
@@ -37,7 +36,6 @@ from deal_hw.calib.validation.residual_place import (
 from deal_hw.calib.validation.signatures import (
     Cause,
     Signature,
-    SignatureResponse,
     held_direction,
     masses,
     place_in_play,
@@ -413,71 +411,6 @@ def test_no_fold_leaves_out_nothing(windows: int) -> None:
 def test_every_window_is_left_out_once_in_stretches() -> None:
     """16 windows in four folds, each of two stretches of two."""
     assert fold_numbers(16, 4, 2).tolist() == [0, 0, 1, 1, 2, 2, 3, 3] * 2
-
-
-def _pushed(
-    varies: Callable[[FloatArray, np.random.Generator], FloatArray],
-) -> tuple[list[WindowRows], list[SignatureResponse]]:
-    """Return residuals of a joint that impulses move, as ``varies`` makes them of what commands change."""
-    rng = np.random.default_rng(3)
-    time = np.arange(SAMPLES) * PERIOD_S
-    answer = 50 * time * np.exp(-20 * time)
-    change = np.sin(2 * np.pi * 0.7 * np.arange(WINDOWS * SAMPLES) * PERIOD_S).reshape(WINDOWS, SAMPLES)
-    impulse = varies(change, rng)
-    moved = np.stack([np.convolve(one, answer)[:SAMPLES] for one in impulse])
-    residual = rng.normal(size=(WINDOWS, SAMPLES)) + moved
-    rows = WindowRows(
-        np.concatenate([residual, np.zeros((WINDOWS, 1))], axis=1),
-        np.zeros((WINDOWS, SAMPLES + 1, 1)),
-        np.concatenate([np.ones((WINDOWS, SAMPLES, 1)), np.full((WINDOWS, 1, 1), 1e-3)], axis=1),
-    )
-    response = np.broadcast_to(answer, (1, WINDOWS, SAMPLES))[..., None]
-    return [rows], [SignatureResponse(response, change[..., None])]
-
-
-def test_random_delays_push_where_commands_change() -> None:
-    """Impulses of 0.5 (standard deviation) times what each command changes: 0.5 s in these units."""
-    rows, answers = _pushed(lambda change, rng: 0.5 * change * rng.standard_normal(change.shape))
-    found = random_delay(rows, answers, PERIOD_S)
-    assert found is not None and found.gain > EVIDENCE
-    assert found.std_s == pytest.approx(0.5, rel=0.15)
-
-
-@pytest.mark.parametrize("windows", [3, 4, 5])
-def test_few_windows_end_in_an_answer_or_none(windows: int) -> None:
-    """Four windows are compared, fewer are not; neither is an error."""
-    (rows,), (answer,) = _pushed(lambda change, rng: np.zeros_like(change))
-    few = dataclasses.replace(
-        rows, residual=rows.residual[:windows], parameter=rows.parameter[:windows], start=rows.start[:windows]
-    )
-    answers = dataclasses.replace(
-        answer, response=answer.response[:, :windows], change=answer.change[:windows]
-    )
-    found = random_delay([few], [answers], PERIOD_S)
-    assert (found is None) == (windows < FEWEST_WINDOWS)
-
-
-@pytest.mark.parametrize("slow", [False, True])
-def test_random_forces_are_no_delays(slow: bool) -> None:
-    """The same impulses at any time, or a force that keeps its value through each window."""
-
-    def force(change: FloatArray, rng: np.random.Generator) -> FloatArray:
-        drawn = rng.standard_normal((WINDOWS, 1 if slow else SAMPLES))
-        return np.asarray(0.35 * drawn * np.ones_like(change))
-
-    found = random_delay(*_pushed(force), PERIOD_S)
-    assert found is not None and found.gain < 1
-
-
-def test_random_delays_are_found_beside_a_random_force() -> None:
-    """The delays of the first test, and a random force at any time of half their size."""
-
-    def both(change: FloatArray, rng: np.random.Generator) -> FloatArray:
-        return 0.5 * change * rng.standard_normal(change.shape) + 0.18 * rng.standard_normal(change.shape)
-
-    found = random_delay(*_pushed(both), PERIOD_S)
-    assert found is not None and found.gain > EVIDENCE
-    assert found.std_s == pytest.approx(0.5, rel=0.2)
 
 
 @pytest.mark.slow
