@@ -75,10 +75,8 @@ class WindowData:
         prior_mean: Prior of the start states: a measurement, an estimate or a weak guess, (W, 2 C).
         prior_std: Its standard deviation, (W, 2 C).
         prior_counts: Entries of the prior that count as measurements, (2 C,).
-        late: Directions in which random delays of commands move whitened predictions, scaled, (W, H M, P);
-            None for constant delays.
-        by_delay: Changes of the whitened predictions by the delay of each command, (W, H M, P) [1/s]; None
-            for constant delays.
+        late: Scaled directions in which delays move whitened predictions, (W, H M, P); None: constant delays.
+        by_delay: Change of whitened predictions by each command's delay, (W, H M, P) [1/s]; likewise None.
     """
 
     episode: int
@@ -207,12 +205,10 @@ class Problem:
             to single commands of these recordings: a problem of others begins without.
         efforts: Columns of the joints whose recorded effort is compared, (E,).
         channels: Indices of the measured channels into (position, velocity, effort), (M,).
-        noise_std: Noise of (position, velocity, effort) over all speeds, (2 C + E,); valid for measured
-            entries only.
+        noise_std: Noise of (position, velocity, effort) at all speeds, (2 C + E,); of measured ones only.
         noise: Noise at rest, and jitter of the sample times.
         starts: Smoothed states of each episode.
-        trees: Number of each coordinate's tree, (C,) an episode; the same one for those that act on each
-            other.
+        trees: Number of each coordinate's tree, (C,) an episode; those that act on each other share it.
     """
 
     robot: RobotModel
