@@ -520,7 +520,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
 def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
     """Return the fit with a delay of its own for each command, if only noise is left then; otherwise None.
 
-    Far from the noise delays seem to explain what no parameters there do.
+    Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
     """
     from deal_hw.calib.validation.explain import FAR
 
@@ -528,7 +528,7 @@ def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
         return None
     run.say("fit", "does each command act after a delay of its own?")
     late = run.random_delays(run.local)
-    if late is None or not conclusive(late.problem, late.fit):
+    if late is None or not conclusive(late.problem, late.fit) or run.shared_error().found is not None:
         return None
     return conclude_fit(run, None, run.local, late=late)
 

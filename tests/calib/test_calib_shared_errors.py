@@ -17,10 +17,11 @@ from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.pipeline import stages
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
-from deal_hw.calib.pipeline.stages import Fits, Refinement, with_shared_error
+from deal_hw.calib.pipeline.stages import Fits, Refinement, with_random_delays, with_shared_error
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import unexplained
+from deal_hw.calib.validation.random_delay import DelayFit, RandomDelay
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.shared_errors import (
     ChannelChange,
@@ -285,3 +286,22 @@ def test_no_step_allowed_no_step_taken(tmp_path: Path) -> None:
     """The check ends before its first simulation."""
     right = problem("pendulum", None, tmp_path)
     assert find_shared_error(right, None, None, 0.0) == SharedErrorCheck(of=5) and right.steps == 0
+
+
+def test_a_wrong_clock_comes_before_delays_that_explain_it(
+    suspected: tuple[CalibrationRun, FoundError, list[Progress]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Delays end the calibration where they leave only noise and nothing is found that is worse."""
+    run, suspicion, _ = suspected
+    fit = at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40)
+    late = DelayFit(run.problem, dataclasses.replace(fit, chi2=1.0), RandomDelay(99.0, 99.0, 0.5, 1e-3), fit)
+    monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: late)
+    monkeypatch.setattr(stages, "conclusive", lambda problem, fit: fit.chi2 < 1.3)
+    concluded: list[DelayFit] = []
+    monkeypatch.setattr(stages, "conclude_fit", lambda *_, late: concluded.append(late))
+    near = dataclasses.replace(run, local=dataclasses.replace(fit, chi2=5.0))
+    assert with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(found=suspicion)])) is None
+    assert with_random_delays(dataclasses.replace(near, local=dataclasses.replace(fit, chi2=26.0))) is None
+    assert concluded == []
+    with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(of=5)]))
+    assert concluded == [late]
