@@ -353,8 +353,11 @@ def _process(
             later = np.zeros((A, H, H, M))
             for k in range(H):
                 later[:, k, k:] = window.response[:, : H - k]
-            size = window.change.T[..., None, None] if late else rms[:, None, None, None]
-            moved = (size * later).reshape(A, H, H * M)
+            if late:
+                # A command is late for all actuators.
+                moved = np.asarray(np.einsum("ka,akhm->khm", window.change, later)).reshape(1, H, H * M)
+            else:
+                moved = (rms[:, None, None, None] * later).reshape(A, H, H * M)
             time_s = np.arange(H, dtype=np.float64) * period_s
         if name in ("slow", "slow delay"):
             apart = np.abs(np.subtract.outer(time_s, time_s))

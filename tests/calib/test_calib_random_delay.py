@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from fakes.knee_evidence import PERIOD_S, SAMPLES, WINDOWS
 
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, random_delay
+from deal_hw.calib.validation.random_delay import FEWEST_WINDOWS, _process, _Window, random_delay
 from deal_hw.calib.validation.signatures import SignatureResponse
 from deal_hw.types import FloatArray
 
@@ -91,3 +92,18 @@ def test_random_delays_are_found_beside_a_random_force() -> None:
     found = random_delay(*_pushed(both), PERIOD_S)
     assert found is not None and found.gain > EVIDENCE
     assert found.std_s == pytest.approx(0.5, rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["delay", "slow delay"])
+def test_a_command_is_late_for_all_actuators(name: Literal["delay", "slow delay"]) -> None:
+    """Of two motors that push against each other a late command does nothing; of two alike, twice as much."""
+    (rows,), (answer,) = _pushed(lambda change, rng: np.zeros_like(change))
+    variances = []
+    for second in (0.0, 1.0, -1.0):
+        both = SignatureResponse(
+            np.concatenate([answer.response, second * answer.response]), np.repeat(answer.change, 2, axis=2)
+        )
+        windows = [_Window.of(rows, both, None, None, w) for w in range(WINDOWS)]
+        variances.append(_process(windows, name, np.ones(2), PERIOD_S)[1])
+    one, alike, against = variances
+    assert alike == pytest.approx(4 * one) and against < 1e-12 * one
