@@ -25,8 +25,6 @@ T = TypeVar("T")
 _TRIES: Final = 5
 """Attempts of a request with corrupt answers; with 5 % corrupt answers all fail once in 10**6."""
 _LISTEN_S: Final = 0.1
-_SILENCE_S: Final = 0.02
-"""Silence after a failed request, beyond which no late answer to it is expected [s]."""
 _MOST_SHARE: Final = 0.5
 """Share of a state's period that one sample and one command may take on the wire; the rest is for delays."""
 
@@ -166,7 +164,7 @@ class ArmExamination:
             try:
                 return request()
             except (TransportTimeoutError, FrameError):
-                self._bus.settle(_SILENCE_S)
+                self._bus.settle()
         return None
 
     def surely(self, servo: ServoEntry, request: Callable[[], T]) -> T:

@@ -274,6 +274,7 @@ class ServoArm(PolledRobot[ServoBus]):
                 now_ns = self._clock.now_ns()
                 if now_ns >= end_ns or (failures >= _MOST_FAILURES and now_ns >= patient_ns):
                     raise
+                self._bus.settle()
                 continue
             if found is None:
                 raise TransportTimeoutError(f"{self._where}: the servos do not answer in time")

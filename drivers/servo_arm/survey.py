@@ -194,6 +194,7 @@ class Survey:
             try:
                 self._sample(tuple(servos))
             except (FrameError, TransportTimeoutError):
+                self.bus.settle()
                 continue
             found.append((self.clock.now_ns() - start_ns) / 1e9)
         return sorted(found)
@@ -204,6 +205,7 @@ class Survey:
                 return request()
             except (TransportTimeoutError, FrameError) as error:
                 last: Exception = error
+                self.bus.settle()
         named = ", ".join(map(str, together)) or str(servo)
         raise TransportTimeoutError(
             f"{self.where}: servo {named} answers no question soundly ({last}). Two servos with one id "

@@ -18,6 +18,8 @@ from deal_hw.transport import Message, Transport
 BITS_PER_BYTE: Final = 10
 """On the wire: start bit, 8 data bits, stop bit."""
 _QUEUE: Final = 4096
+_SILENCE_NS: Final = 20_000_000
+"""Silence after a failed request, beyond which no late answer to it is expected [ns]."""
 _MOST_LATE: Final = 100
 """Messages that are discarded at most after a failed request."""
 
@@ -251,13 +253,14 @@ class ServoBus(abc.ABC):
         self._wanted.popleft()
         return found
 
-    def settle(self, seconds: float) -> None:
-        """Discard what arrives until the line was silent for a time [s].
+    def settle(self) -> None:
+        """Discard what arrives until the line is silent; for after a failed request, before it is repeated.
 
-        An answer to a request that was given up may still come, and be taken for that to the next request.
+        An answer to a request that was given up may still come. It would be taken for that to the next
+        request, or as a corrupt one; and the next answer for that to the one after it, without an end.
         """
         for _ in range(_MOST_LATE):
-            if not self._port.receive(self._clock.now_ns() + round(seconds * 1e9)):
+            if not self._port.receive(self._clock.now_ns() + _SILENCE_NS):
                 break
         self._forget()
 

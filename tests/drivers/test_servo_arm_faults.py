@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +11,21 @@ from arm_rig import BUSES, Rig
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deal_hw.clock import VirtualClock
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
 from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.servo_arm.absence import SILENT_NS, AbsenceWatch
-from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
+from deal_hw.drivers.servo_arm.families import DAMPING, FAMILIES, OFF, ON
 from deal_hw.drivers.servo_arm.faults import ArmFaults
+from deal_hw.drivers.servo_arm.robot import ServoArm
 from deal_hw.drivers.servo_bus import registers as r
 from deal_hw.drivers.servo_bus.interface import SilentServosError
 from deal_hw.errors import ConfigurationError, FrameError, SafetyError, TransportTimeoutError
 from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.testing.faults import FaultyTransport, OneBadFrame
+from deal_hw.transport import Message, Transport, TransportWrapper
 from deal_hw.workflows.emulation.plug_in import request_of
 from deal_hw.workflows.emulation.settings import EmulateArmSettings
 
@@ -270,3 +274,51 @@ def test_an_absent_servos_watchdog_counts_its_own_silence(tmp_path: Path) -> Non
     rig.run(20)
     assert [servo.watchdog_tripped for servo in rig.servos] == [False, True]
     assert rig.servos[1].get(r.TORQUE_ENABLE) == 1
+
+
+# An answer that comes too late.
+
+
+class OneLateAnswer(TransportWrapper):
+    """A transport that delays what the servos answer to the next message, if it is told so."""
+
+    def __init__(self, inner: Transport, clock: VirtualClock) -> None:
+        super().__init__(inner)
+        self.next_is_late = False
+        self._clock = clock
+        self._delay_ns = 0
+        self._waiting: deque[tuple[int, Message]] = deque()
+
+    def send(self, message: Message) -> None:
+        """Send a message; the answer to the first one is late."""
+        self._delay_ns, self.next_is_late = 20_000_000 * self.next_is_late, False
+        self._inner.send(message)
+
+    def receive(self, timeout_s: float) -> Message:
+        """Receive the next message at its time."""
+        end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
+        while not self._waiting or self._waiting[0][0] > self._clock.now_ns():
+            until_ns = min(end_ns, self._waiting[0][0]) if self._waiting else end_ns
+            try:
+                message = self._inner.receive(max(0, until_ns - self._clock.now_ns()) / 1e9)
+                due_ns = self._clock.now_ns() + self._delay_ns
+                # Bytes do not overtake each other.
+                self._waiting.append((max([due_ns, *(before for before, _ in self._waiting)]), message))
+            except TransportTimeoutError:
+                if until_ns == end_ns:
+                    raise
+        return self._waiting.popleft()[1]
+
+
+def test_a_request_is_repeated_after_the_late_answer(tmp_path: Path, bus: str) -> None:
+    """One sample is missed. Otherwise all answers stay one request behind, and are refused as corrupt."""
+    rig = Rig(tmp_path, bus)
+    link = OneLateAnswer(rig.virtual, rig.clock)
+    assert rig.file.servo_bus is not None
+    robot = ServoArm(link, rig.clock, rig.description, rig.file.servo_bus, FAMILIES[bus]())
+    robot.connect()
+    robot.home(5.0)
+    before = robot.transport_errors
+    link.next_is_late = True
+    robot.arm(1.0)
+    assert robot.transport_errors == before + 1

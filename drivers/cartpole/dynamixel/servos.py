@@ -81,6 +81,7 @@ class Servos:
                     raise TransportTimeoutError(
                         f"cartpole: {error}; check that both servos are powered, and the cable"
                     ) from error
+                self._bus.settle()
             else:
                 raise TransportTimeoutError("cartpole: the servos' answer did not arrive in time")
 
