@@ -52,10 +52,10 @@ SLOW_S = 0.1
 VARIANCE_RATIO = (1e-5, 1e5)
 """Least and largest ratio of the mean variances of a process and the noise [-]."""
 
-MOST_SPACED = 2.0
+MOST_SPACED = 2.5
 """Largest standard deviation of delays, in times between commands [-]. Above a third of that time some
 commands wait for those before them, so their delays are no longer independent. On pendulums at 200 Hz, with
-0.6 and 1.3 times that time, fits that took them as independent left a chi2 of 1.07 and 1.00."""
+0.6, 1.3 and 1.6 times that time, fits that took them as independent left a chi2 of 1.07, 1.00 and 1.00."""
 
 SETTLED = 0.01
 """Share of the commands that may still move by a period when the rounds of one window length end [-]."""
@@ -134,22 +134,25 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
     none = CommandDelays(0.0, refined.theta, refined.latency_s, still)
     # A fit that ended early has seen a part of the recordings only.
     part = refined.shooting.problem.with_command_delays(none)
-    seen = _seen(part, refined)
-    if seen is None:
-        return None
+    asked = refined
+    while (seen := _seen(part, asked)) is None:
+        # Its windows may hold too many commands, and those of the stage before it fewer.
+        if asked.shorter is None:
+            return None
+        asked = asked.shorter
     rows, columns = seen
-    times = [command_times(part, d, c.shape[2]) for d, c in zip(refined.shooting.data, columns, strict=True)]
+    times = [command_times(part, d, c.shape[2]) for d, c in zip(asked.shooting.data, columns, strict=True)]
     period_s = problem.episodes[0].period_s
-    found = random_delay(rows, answers(part, refined), period_s, columns, times)
+    found = random_delay(rows, answers(part, asked), period_s, columns, times)
     if found is None or not found.gain > least:
         return None
-    std_s, gain = _likely(part, refined, rows, columns)
+    std_s, gain = _likely(part, asked, rows, columns)
     most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
     if not gain > least or std_s > most_s:
         return None
-    delayed = _with(problem.with_command_delays(none), refined, std_s)
+    delayed = _with(problem.with_command_delays(none), asked, std_s)
     best: Refined | None = None
-    fit = refined
+    fit = asked
     for seconds in STAGES_S:
         states = None if best is None else best.shooting.states(best.point)
         if best is not None and _too_many(delayed, seconds):

@@ -28,7 +28,7 @@ from deal_hw.calib.fit.command_delays import (
     with_command_delays,
 )
 from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.fit.refinement import STAGES_S, Refined, refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.stages import conclude_fit
@@ -265,6 +265,23 @@ def test_the_mean_delay_of_a_jittering_link_is_found(jittering: Case) -> None:
     more = Parameter.around("cart.more", "dof_damping", ("cart",), "N·s/m", 0.1)
     more_delays = late.problem.with_more([more]).command_delays
     assert more_delays is not None and more_delays.theta.shape == (len(space) + 1,)
+
+
+@pytest.mark.slow
+def test_delays_are_asked_of_windows_that_do_not_hold_too_many_commands(
+    jittering: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the longest windows of a fit do, those of its last stage before them are asked."""
+    problem, theta = _problem_of(jittering, ("cart.mass", "servo.stiffness", "servo.damping"))
+    short, long = (refine(problem, theta, jittering.latency_s, (seconds,)) for seconds in STAGES_S[:2])
+    constant = dataclasses.replace(long, shorter=short)
+    most = max(commands_of(problem, data) for data in long.shooting.data)
+    for module in (command_delays_module, random_delay_module):
+        monkeypatch.setattr(module, "MOST_COMMANDS", most - 1)
+    assert fit_delays(problem, long, EVIDENCE) is None
+    late = fit_delays(problem, constant, EVIDENCE)
+    assert late is not None and late.before is constant
+    assert late.fit.chi2 < 1.1 and late.fit.shooting.length == short.shooting.length
 
 
 @pytest.mark.slow
