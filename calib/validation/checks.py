@@ -126,14 +126,16 @@ def hold_windows(known: Uncertainty, latency_s: float, fit: Refined) -> Uncertai
         longer, shorter = shorter, shorter.shorter
     if fit.refused is not None and fit.refused.chi2 < LOCAL_HOPELESS * max(fit.chi2, 1.0):
         others.append(fit.refused)
+    # A law that was taken on top of these fits has parameters that they do not have.
+    K, fitted = len(problem.space), np.r_[: len(problem.space), -1]
     excess = np.zeros(len(space) + 1)
     for other in others:
         own = uncertainty_at(problem, other)
         late_std = own.latency_reach_s(other.latency_s) / Z90
         std = np.append(np.sqrt(np.diag(own.covariance)), late_std)
-        moved = space.to_scale(other.theta) - space.to_scale(known.theta)
+        moved = problem.space.to_scale(other.theta) - problem.space.to_scale(known.theta[:K])
         square = np.append(moved, other.latency_s - latency_s) ** 2
-        excess = np.maximum(excess, np.sqrt(np.maximum(square - std**2, 0.0)))
+        excess[fitted] = np.maximum(excess[fitted], np.sqrt(np.maximum(square - std**2, 0.0)))
     excess[:-1][known.blind] = 0.0
     wider = known.widened_to(np.sqrt(np.diag(known.covariance)) + excess[:-1] / Z90)
     if reach_s := known.latency_reach_s(latency_s):

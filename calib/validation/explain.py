@@ -225,10 +225,18 @@ def _gains(
 
 
 def screened_gain(known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_]) -> float:
-    """Return the held-out deviance that an explanation gains by its linearised effect alone.
+    """Return the held-out deviance that an explanation gains by its linearised effect alone."""
+    return screened_effect(known, law, one_way)[0]
 
-    A dead zone below 0 explains what friction does, too, but no robot has one. Parameters that would have to
-    leave their range have no effect.
+
+def screened_effect(
+    known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_]
+) -> tuple[float, FloatArray]:
+    """Return what an explanation gains by its linearised effect alone, and where the values go with it.
+
+    That is the held-out deviance, and the change of the own parameters, in their scales, and of the latency
+    [s], (K + 1,). A dead zone below 0 explains what friction does, too, but no robot has one. Parameters that
+    would have to leave their range have no effect.
 
     Args:
         known: The evidence.
@@ -239,12 +247,13 @@ def screened_gain(known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_
     while len(kept):
         mine = dataclasses.replace(law, columns=tuple(columns[..., kept] for columns in law.columns))
         # The residual is prediction minus measurement: a parameter moves against its coefficient.
-        moves = -known.coefficients([mine])[len(known.prior) :]
-        left = kept[(moves > 0) | ~one_way[kept]]
+        moves = -known.coefficients([mine])
+        own, further = np.split(moves, [len(known.prior)])
+        left = kept[(further > 0) | ~one_way[kept]]
         if len(left) == len(kept):
-            return known.gain([], [mine])
+            return known.gain([], [mine]), own
         kept = left
-    return 0.0
+    return 0.0, np.zeros(len(known.prior))
 
 
 def screened(

@@ -151,7 +151,7 @@ def test_a_column_is_what_a_late_command_does(noisy: Case, noisy_problem: Proble
 
 
 def test_commands_move_to_their_likeliest_delay(noisy: Case, noisy_problem: Problem) -> None:
-    """One command acts 4 ms late, without noise: in three steps it is moved by 4 periods.
+    """One command acts 4 ms late, without noise: in four steps it is moved by 4 periods.
 
     Delays stay unknowns around the mean.
     """
@@ -170,7 +170,7 @@ def test_commands_move_to_their_likeliest_delay(noisy: Case, noisy_problem: Prob
     measured = predicted(plain.with_command_delays(None, [_late(episode, late, 4)]))
     known = CommandDelays(5e-3, noisy.theta, noisy.latency_s, ({},))
     problem = plain.with_command_delays(known)
-    for _ in range(3):
+    for _ in range(4):
         residual = ((predicted(problem) - measured) / data.std).reshape(len(data.windows), -1)
         # Nothing but the delays is unknown.
         rows = FreeRows(residual, columns_of(problem), np.zeros((*residual.shape, 0)))

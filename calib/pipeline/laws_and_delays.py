@@ -1,0 +1,182 @@
+"""Laws that a model lacks, on top of delays of single commands.
+
+Friction that falls with speed makes a joint late where it turns round, and commands that jitter make it late
+at some places more than at others. A robot that has both is explained by neither alone: delays take up a part
+of the friction, and of the values with it. So laws are asked for again on top of the delays. A law is taken
+where its effect is seen in windows that it was not fitted to, and its fit is likelier by more than chance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.fit.intervals import EVIDENCE, with_rows
+from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
+from deal_hw.calib.pipeline.minima import conclusive
+from deal_hw.calib.pipeline.stages import conclude_fit
+from deal_hw.calib.validation.candidates import Candidate
+from deal_hw.calib.validation.cause_words import Diagnosis
+from deal_hw.calib.validation.checks import hold_alike
+from deal_hw.calib.validation.evidence import Evidence, evidence
+from deal_hw.calib.validation.explain import FAR, applicable, screened, screened_effect, screened_gain
+from deal_hw.calib.validation.explanations import ZERO_CAUSES, Explanation, one_sided, sized, tried_value
+from deal_hw.calib.validation.signatures import Signature
+from deal_hw.calib.validation.wider_models import WiderFit, wider_cost
+from deal_hw.calibration import listed
+from deal_hw.errors import CalibrationError, InsufficientDataError
+from deal_hw.findings import Finding
+from deal_hw.parameters import Parameter
+from deal_hw.types import FloatArray
+
+if TYPE_CHECKING:
+    from deal_hw.calib.validation.random_delay import DelayFit
+
+MOST_LAWS = 2
+"""Most laws on top of the delays."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Stack:
+    """A fit with delays of single commands, and the laws that were taken on top of them.
+
+    Attributes:
+        run: The calibration of the recordings with the laws, without the delays.
+        late: The fit.
+        laws: The laws, as causes, by their names.
+    """
+
+    run: CalibrationRun
+    late: DelayFit
+    laws: Mapping[str, Diagnosis] = dataclasses.field(default_factory=dict)
+
+
+def with_laws_and_delays(run: CalibrationRun) -> FitOutcome | None:
+    """Return the fit with delays of single commands, and laws, if only noise is left then; else None.
+
+    Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
+    """
+    if run.local is None or run.local.chi2 > FAR:
+        return None
+    run.say("fit", "does each command act after a delay of its own?")
+    if (late := run.random_delays(run.local)) is None:
+        return None
+    stack = _Stack(run, late)
+    while True:
+        with run.check(EXPLANATIONS):
+            wider, effects = _with_a_law(stack)
+        if wider is None:
+            break
+        stack = wider
+    late = stack.late
+    if not conclusive(late.problem, late.fit) or run.shared_error().found is not None:
+        return None
+    outcome = conclude_fit(stack.run, None, run.local, late=late)
+    # A law that gains something, though no more than chance does, may be there. It would change the values.
+    # Its linearised effect says where to.
+    if shifts := [shift for gain, shift in effects if 0 < gain <= EVIDENCE]:
+        known, added = hold_alike(late.problem, outcome.known, outcome.latency_s, shifts)
+        outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
+    rows = [Candidate.of(name, "likelihood", law, "taken").to_json() for name, law in stack.laws.items()]
+    return outcome.with_alarms(
+        *stack.laws.values(),
+        diagnosis=[*outcome.facts.get("diagnosis", []), *(law.to_json() for law in stack.laws.values())],
+        candidates=[*outcome.facts.get("candidates", []), *rows],
+    )
+
+
+def _with_a_law(stack: _Stack) -> tuple[_Stack | None, list[tuple[float, FloatArray]]]:
+    """Return the fit with one more law; None where no law gains.
+
+    What each law gains by its linearised effect follows, with where the values go then.
+    """
+    problem, fit = stack.late.problem, with_rows(stack.late.fit)
+    can = {each: more for each, more in applicable(problem).items() if stack.run.takes(each)}
+    can = {each: more for each, more in can.items() if each.name not in stack.laws}
+    if not can:
+        return None, []
+    seen = evidence(problem, fit, answered=False)
+    at = problem, fit.theta, fit.latency_s, fit.shooting, fit.point
+    effects = {each: screened(*at, each, more) for each, more in can.items()}
+    screen = {
+        each: screened_effect(seen, effects[each], one_sided(problem, more)) for each, more in can.items()
+    }
+    gains = {each: gain for each, (gain, _) in screen.items()}
+    return _taken(stack, seen, effects, can, gains), list(screen.values())
+
+
+def _taken(
+    stack: _Stack,
+    seen: Evidence,
+    effects: Mapping[Explanation, Signature],
+    can: Mapping[Explanation, Sequence[Parameter]],
+    gains: Mapping[Explanation, float],
+) -> _Stack | None:
+    """Return the fit with the law that gains most, by its linearised effect and its fit; None without one."""
+    run, problem, fit = stack.run, stack.late.problem, stack.late.fit
+    best = max(gains, key=lambda each: gains[each])
+    more = can[best]
+    if len(stack.laws) == MOST_LAWS or gains[best] <= EVIDENCE:
+        return None
+    if not run.may_try(best.name, wider_cost(problem, True, len(more))):
+        return None
+    run.say("fit", f"{best.name} on top of that")
+    wide = _fitted(problem, fit, _seen_alone(seen, effects[best], problem, more))
+    if wide is None:
+        return None
+    rivals = [e.name for e, gain in gains.items() if e is not best and gains[best] - gain < EVIDENCE < gain]
+    law = _cause(wide, fit, best, rivals)
+    if law.deviance <= EVIDENCE:
+        return None
+    late = dataclasses.replace(stack.late, problem=wide.fit.shooting.problem, fit=wide.fit)
+    of = dataclasses.replace(run, problem=run.problem.with_more(wide.more))
+    return _Stack(of, late, {**stack.laws, best.name: law})
+
+
+def _seen_alone(
+    seen: Evidence, effect: Signature, problem: Problem, more: Sequence[Parameter]
+) -> list[Parameter]:
+    """Return a law's parameters at the joints that show it, each by its own effect; all where none does."""
+    one_way, sizes = one_sided(problem, more), sized(more)
+    places: set[str] = set()
+    for n, k in enumerate(sizes):
+        own = dataclasses.replace(effect, columns=tuple(columns[..., [n]] for columns in effect.columns))
+        if screened_gain(seen, own, one_way[[n]]) > EVIDENCE:
+            places |= set(more[k].elements)
+    return [p for p in more if not places or places & set(p.elements)]
+
+
+def _fitted(problem: Problem, fit: Refined, more: Sequence[Parameter]) -> WiderFit | None:
+    """Return the fit with a law's parameters, in the same windows; None where it cannot be fitted."""
+    theta = np.append(fit.theta, [tried_value(p) for p in more])
+    window_s = fit.shooting.length * problem.episodes[0].period_s
+    states = fit.shooting.states(fit.point)
+    try:
+        found = refine(problem.with_more(more), theta, fit.latency_s, (window_s,), states=states)
+    except (InsufficientDataError, CalibrationError):
+        return None
+    return WiderFit(problem, more, found, found)
+
+
+def _cause(wide: WiderFit, fit: Refined, law: Explanation, rivals: Sequence[str]) -> Diagnosis:
+    """Return a law that the result has as a cause of the residual; ``fit`` is without it."""
+    before, after = fit.chi2, wide.fit.chi2
+    values = [f"{p.name} = {v:.2g} {p.unit}".rstrip(" -") for p, v in zip(wide.more, wide.found, strict=True)]
+    do = law.taken.replace("{}", listed([p.name for p in wide.more]))
+    if rivals:
+        do += f" Recordings like these do not tell it from {listed(list(rivals))}."
+    alarm = Finding.alarm(
+        f"With {law.name} ({listed(values)}) the fit leaves a chi2 of {after:.3g} instead of {before:.3g}.",
+        law.means,
+        do,
+    )
+    deviance = fit.normal.count * float(np.log(before / after))
+    elements = tuple(dict.fromkeys(e for p in wide.more for e in p.elements))
+    kind = ZERO_CAUSES.get(wide.more[0].kind, law.cause)
+    return Diagnosis.of(kind, 1 - after / before, deviance, elements, alarm, wide.shift_of(fit))
