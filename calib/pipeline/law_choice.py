@@ -37,7 +37,7 @@ from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome, ranked
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks
 from deal_hw.calib.validation.explain import RIVAL, applicable
-from deal_hw.calib.validation.explanations import LAG, Explanation
+from deal_hw.calib.validation.explanations import LAG, Explanation, values_in_words
 from deal_hw.calib.validation.wider_models import NOTICED
 from deal_hw.calibration import LATENCY, CalibrationResult, listed, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -96,7 +96,7 @@ class LawCandidate:
     def finding(self, choice: LawfulChoice, theta: FloatArray) -> Finding:
         """Return what was found where a fit with the law was chosen, with its values, (K + L,)."""
         found = self._values(theta)
-        values = listed([f"{p.name} = {found[p.name]:.2g} {p.unit}".rstrip(" -") for p in self.more])
+        values = values_in_words(self.more, [found[p.name] for p in self.more])
         lower = percent(1 - float(np.exp(np.mean(np.log(choice.ratios)))))
         law = self.explanation
         return Finding.alarm(

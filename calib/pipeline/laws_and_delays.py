@@ -26,7 +26,14 @@ from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_alike
 from deal_hw.calib.validation.evidence import Evidence, evidence
 from deal_hw.calib.validation.explain import FAR, applicable, screened, screened_effect, screened_gain
-from deal_hw.calib.validation.explanations import ZERO_CAUSES, Explanation, one_sided, sized, tried_value
+from deal_hw.calib.validation.explanations import (
+    ZERO_CAUSES,
+    Explanation,
+    one_sided,
+    sized,
+    tried_value,
+    values_in_words,
+)
 from deal_hw.calib.validation.signatures import Signature
 from deal_hw.calib.validation.wider_models import WiderFit, wider_cost
 from deal_hw.calibration import listed
@@ -167,12 +174,12 @@ def _fitted(problem: Problem, fit: Refined, more: Sequence[Parameter]) -> WiderF
 def _cause(wide: WiderFit, fit: Refined, law: Explanation, rivals: Sequence[str]) -> Diagnosis:
     """Return a law that the result has as a cause of the residual; ``fit`` is without it."""
     before, after = fit.chi2, wide.fit.chi2
-    values = [f"{p.name} = {v:.2g} {p.unit}".rstrip(" -") for p, v in zip(wide.more, wide.found, strict=True)]
+    values = values_in_words(wide.more, list(map(float, wide.found)))
     do = law.taken.replace("{}", listed([p.name for p in wide.more]))
     if rivals:
         do += f" Recordings like these do not tell it from {listed(list(rivals))}."
     alarm = Finding.alarm(
-        f"With {law.name} ({listed(values)}) the fit leaves a chi2 of {after:.3g} instead of {before:.3g}.",
+        f"With {law.name} ({values}) the fit leaves a chi2 of {after:.3g} instead of {before:.3g}.",
         law.means,
         do,
     )

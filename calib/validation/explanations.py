@@ -17,6 +17,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.validation.cause_words import LOOKS
 from deal_hw.calib.validation.signatures import Cause, masses
 from deal_hw.calib.validation.wider_models import MOST_FORCE, motion, zero_parameters
+from deal_hw.calibration import listed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters import KIND_TABLE
@@ -407,6 +408,12 @@ def one_sided(problem: Problem, parameters: Sequence[Parameter]) -> npt.NDArray[
         ],
         dtype=bool,
     )
+
+
+def values_in_words(parameters: Sequence[Parameter], values: Sequence[float]) -> str:
+    """Return found values as in an alarm: "a.play = 0.01 rad and b.play = 0.02 rad"."""
+    pairs = zip(parameters, values, strict=True)
+    return listed([f"{p.name} = {value:.2g} {p.unit}".rstrip(" -") for p, value in pairs])
 
 
 def tried_value(p: Parameter) -> float:
