@@ -159,7 +159,6 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
         problem = run.problem
         from deal_hw.calib.fit.channel_weights import weight_channels
-        from deal_hw.calib.pipeline.laws_and_delays import with_laws_and_delays
         from deal_hw.calib.validation.explain import try_explanations
 
         # Another minimum can leave a residual as small as noise, but with a pattern.
@@ -189,7 +188,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
                 with run.check(EXPLANATIONS):
                     tried = try_explanations(problem, with_rows(local), run.may_try, say=run.ask)
                 run = dataclasses.replace(run, tried=tried)
-            found = with_explanation(run) or with_laws_and_delays(run) or with_shared_error(fits, run)
+            found = with_explanation(run) or with_random_delays(run) or with_shared_error(fits, run)
         found = found if zeros is None else zeros.said(found)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
@@ -516,6 +515,26 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, *_ in others))],
         candidates=[row.to_json() for row in ranked(rows)],
     )
+
+
+def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
+    """Return the fit with delays of single commands, and laws, if only noise is left then; otherwise None.
+
+    Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
+    """
+    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
+    from deal_hw.calib.validation.explain import FAR
+
+    if run.local is None or run.local.chi2 > FAR:
+        return None
+    run.say("fit", "does each command act after a delay of its own?")
+    if (delays := run.random_delays(run.local)) is None:
+        return None
+    found = laws_on_delays(run, delays)
+    late = found.late
+    if not conclusive(late.problem, late.fit) or run.shared_error().found is not None:
+        return None
+    return found.said(conclude_fit(found.run, None, run.local, late=late))
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

@@ -15,10 +15,15 @@ from hypothesis import strategies as st
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
-from deal_hw.calib.pipeline import laws_and_delays, stages
+from deal_hw.calib.pipeline import laws_on_delays, stages
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
-from deal_hw.calib.pipeline.laws_and_delays import with_laws_and_delays
-from deal_hw.calib.pipeline.stages import Fits, Refinement, with_shared_error, without_search
+from deal_hw.calib.pipeline.stages import (
+    Fits,
+    Refinement,
+    with_random_delays,
+    with_shared_error,
+    without_search,
+)
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import unexplained
@@ -297,8 +302,8 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
     fit = at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40)
     late = DelayFit(run.problem, dataclasses.replace(fit, chi2=1.0), RandomDelay(99.0, 99.0, 0.5, 1e-3), fit)
     monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: late)
-    monkeypatch.setattr(laws_and_delays, "conclusive", lambda problem, fit: fit.chi2 < 1.3)
-    monkeypatch.setattr(laws_and_delays, "_with_a_law", lambda stack: (None, []))
+    monkeypatch.setattr(stages, "conclusive", lambda problem, fit: fit.chi2 < 1.3)
+    monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda before: (None, []))
     concluded: list[DelayFit] = []
     ended = without_search(run.problem, run.budget, fit)
     known = uncertainty_at(run.problem, fit)
@@ -308,10 +313,10 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
         concluded.append(late)
         return outcome
 
-    monkeypatch.setattr(laws_and_delays, "conclude_fit", conclude)
+    monkeypatch.setattr(stages, "conclude_fit", conclude)
     near = dataclasses.replace(run, local=dataclasses.replace(fit, chi2=5.0))
-    assert with_laws_and_delays(dataclasses.replace(near, shared=[SharedErrorCheck(found=suspicion)])) is None
-    assert with_laws_and_delays(dataclasses.replace(near, local=dataclasses.replace(fit, chi2=26.0))) is None
+    assert with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(found=suspicion)])) is None
+    assert with_random_delays(dataclasses.replace(near, local=dataclasses.replace(fit, chi2=26.0))) is None
     assert concluded == []
-    with_laws_and_delays(dataclasses.replace(near, shared=[SharedErrorCheck(of=5)]))
+    with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(of=5)]))
     assert concluded == [late]

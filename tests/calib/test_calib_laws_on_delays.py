@@ -11,7 +11,7 @@ from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import Refined, at_parameters
-from deal_hw.calib.pipeline import laws_and_delays
+from deal_hw.calib.pipeline import laws_on_delays
 from deal_hw.calib.pipeline.methods import usual_budget
 from deal_hw.calib.validation.checks import hold_windows
 from deal_hw.calib.validation.explain import applicable
@@ -53,14 +53,14 @@ def test_only_joints_that_show_a_law_get_it(noisy_problem: Problem, monkeypatch:
     effect = Signature("friction", FALLING, (np.arange(2.0) * np.ones((3, 4, 1)),))
     alone = {0.0: 30.0, 1.0: 5.0}
     monkeypatch.setattr(
-        laws_and_delays, "screened_gain", lambda seen, own, way: alone[float(own.columns[0][0, 0, 0])]
+        laws_on_delays, "screened_gain", lambda seen, own, way: alone[float(own.columns[0][0, 0, 0])]
     )
     seen: object = None
-    found = laws_and_delays._seen_alone(seen, effect, noisy_problem, more)  # type: ignore[arg-type]
+    found = laws_on_delays._seen_alone(seen, effect, noisy_problem, more)  # type: ignore[arg-type]
     first = more[sized(more)[0]].elements
     assert [p.elements for p in found] == [first, first] and len({p.kind for p in found}) == 2
     alone[0.0] = 5.0
-    assert laws_and_delays._seen_alone(seen, effect, noisy_problem, more) == more  # type: ignore[arg-type]
+    assert laws_on_delays._seen_alone(seen, effect, noisy_problem, more) == more  # type: ignore[arg-type]
 
 
 def test_intervals_hold_shorter_windows_beside_a_law(noisy_problem: Problem, noisy_refined: Refined) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,13 +19,11 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
-from deal_hw.calib.pipeline.minima import conclusive
-from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.validation.candidates import Candidate
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_alike
 from deal_hw.calib.validation.evidence import Evidence, evidence
-from deal_hw.calib.validation.explain import FAR, applicable, screened, screened_effect, screened_gain
+from deal_hw.calib.validation.explain import applicable, screened, screened_effect, screened_gain
 from deal_hw.calib.validation.explanations import (
     ZERO_CAUSES,
     Explanation,
@@ -50,62 +48,55 @@ MOST_LAWS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class _Stack:
+class LawsOnDelays:
     """A fit with delays of single commands, and the laws that were taken on top of them.
 
     Attributes:
         run: The calibration of the recordings with the laws, without the delays.
         late: The fit.
         laws: The laws, as causes, by their names.
+        shifts: Where the values would go, in their scales, and the latency [s], (K + 1,), with each law that
+            gains something, though no more than chance does: it may be there.
     """
 
     run: CalibrationRun
     late: DelayFit
-    laws: Mapping[str, Diagnosis] = dataclasses.field(default_factory=dict)
+    laws: Mapping[str, Diagnosis] = field(default_factory=dict)
+    shifts: Sequence[FloatArray] = ()
+
+    def said(self, outcome: FitOutcome) -> FitOutcome:
+        """Return the result of the fit with its laws as alarms, and intervals that hold the shifts."""
+        if self.shifts:
+            known, added = hold_alike(self.late.problem, outcome.known, outcome.latency_s, self.shifts)
+            outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
+        rows = [Candidate.of(name, "likelihood", law, "taken") for name, law in self.laws.items()]
+        return outcome.with_alarms(
+            *self.laws.values(),
+            diagnosis=[*outcome.facts.get("diagnosis", []), *(law.to_json() for law in self.laws.values())],
+            candidates=[*outcome.facts.get("candidates", []), *(row.to_json() for row in rows)],
+        )
 
 
-def with_laws_and_delays(run: CalibrationRun) -> FitOutcome | None:
-    """Return the fit with delays of single commands, and laws, if only noise is left then; else None.
-
-    Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
-    """
-    if run.local is None or run.local.chi2 > FAR:
-        return None
-    run.say("fit", "does each command act after a delay of its own?")
-    if (late := run.random_delays(run.local)) is None:
-        return None
-    stack = _Stack(run, late)
+def laws_on_delays(run: CalibrationRun, late: DelayFit) -> LawsOnDelays:
+    """Return a fit with delays of single commands with the laws that it shows on top of them."""
+    found = LawsOnDelays(run, late)
     while True:
         with run.check(EXPLANATIONS):
-            wider, effects = _with_a_law(stack)
+            wider, effects = _with_a_law(found)
         if wider is None:
-            break
-        stack = wider
-    late = stack.late
-    if not conclusive(late.problem, late.fit) or run.shared_error().found is not None:
-        return None
-    outcome = conclude_fit(stack.run, None, run.local, late=late)
-    # A law that gains something, though no more than chance does, may be there. It would change the values.
-    # Its linearised effect says where to.
-    if shifts := [shift for gain, shift in effects if 0 < gain <= EVIDENCE]:
-        known, added = hold_alike(late.problem, outcome.known, outcome.latency_s, shifts)
-        outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
-    rows = [Candidate.of(name, "likelihood", law, "taken").to_json() for name, law in stack.laws.items()]
-    return outcome.with_alarms(
-        *stack.laws.values(),
-        diagnosis=[*outcome.facts.get("diagnosis", []), *(law.to_json() for law in stack.laws.values())],
-        candidates=[*outcome.facts.get("candidates", []), *rows],
-    )
+            unsure = tuple(shift for gain, shift in effects if 0 < gain <= EVIDENCE)
+            return dataclasses.replace(found, shifts=unsure)
+        found = wider
 
 
-def _with_a_law(stack: _Stack) -> tuple[_Stack | None, list[tuple[float, FloatArray]]]:
+def _with_a_law(before: LawsOnDelays) -> tuple[LawsOnDelays | None, list[tuple[float, FloatArray]]]:
     """Return the fit with one more law; None where no law gains.
 
     What each law gains by its linearised effect follows, with where the values go then.
     """
-    problem, fit = stack.late.problem, with_rows(stack.late.fit)
-    can = {each: more for each, more in applicable(problem).items() if stack.run.takes(each)}
-    can = {each: more for each, more in can.items() if each.name not in stack.laws}
+    problem, fit = before.late.problem, with_rows(before.late.fit)
+    can = {each: more for each, more in applicable(problem).items() if before.run.takes(each)}
+    can = {each: more for each, more in can.items() if each.name not in before.laws}
     if not can:
         return None, []
     seen = evidence(problem, fit, answered=False)
@@ -115,21 +106,21 @@ def _with_a_law(stack: _Stack) -> tuple[_Stack | None, list[tuple[float, FloatAr
         each: screened_effect(seen, effects[each], one_sided(problem, more)) for each, more in can.items()
     }
     gains = {each: gain for each, (gain, _) in screen.items()}
-    return _taken(stack, seen, effects, can, gains), list(screen.values())
+    return _taken(before, seen, effects, can, gains), list(screen.values())
 
 
 def _taken(
-    stack: _Stack,
+    before: LawsOnDelays,
     seen: Evidence,
     effects: Mapping[Explanation, Signature],
     can: Mapping[Explanation, Sequence[Parameter]],
     gains: Mapping[Explanation, float],
-) -> _Stack | None:
+) -> LawsOnDelays | None:
     """Return the fit with the law that gains most, by its linearised effect and its fit; None without one."""
-    run, problem, fit = stack.run, stack.late.problem, stack.late.fit
+    run, problem, fit = before.run, before.late.problem, before.late.fit
     best = max(gains, key=lambda each: gains[each])
     more = can[best]
-    if len(stack.laws) == MOST_LAWS or gains[best] <= EVIDENCE:
+    if len(before.laws) == MOST_LAWS or gains[best] <= EVIDENCE:
         return None
     if not run.may_try(best.name, wider_cost(problem, True, len(more))):
         return None
@@ -141,9 +132,9 @@ def _taken(
     law = _cause(wide, fit, best, rivals)
     if law.deviance <= EVIDENCE:
         return None
-    late = dataclasses.replace(stack.late, problem=wide.fit.shooting.problem, fit=wide.fit)
+    late = dataclasses.replace(before.late, problem=wide.fit.shooting.problem, fit=wide.fit)
     of = dataclasses.replace(run, problem=run.problem.with_more(wide.more))
-    return _Stack(of, late, {**stack.laws, best.name: law})
+    return LawsOnDelays(of, late, {**before.laws, best.name: law})
 
 
 def _seen_alone(
