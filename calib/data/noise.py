@@ -243,14 +243,9 @@ def noise_model(
         x = np.array([squared[part].mean() for part in parts])
         y = np.array([_spread(difference[part], order) ** 2 for part in parts])
         y = np.maximum(y, rounding[j] ** 2)
-        # n samples give a variance to sqrt(2 / n), relative, and neighbouring differences share samples. That
-        # is of the line's variance: weights by what each bin has found prefer those that found too little.
-        share, line = math.sqrt(2.0 * SHARED / len(parts[0])), y
-        for _ in range(REWEIGHTED):
-            sigma = share * line + floor**2 + saw_tooth
-            slope, error = _slope(x, y, sigma)
-            rest = float(np.average(y - max(slope, 0.0) * x, weights=1 / sigma**2))
-            line = np.maximum(rest + max(slope, 0.0) * x, max(rounding[j], floor) ** 2)
+        # n samples give a variance to sqrt(2 / n), relative, and neighbouring differences share samples.
+        share = math.sqrt(2.0 * SHARED / len(parts[0]))
+        slope, error, sigma = _line(x, y, share, floor**2 + saw_tooth, max(rounding[j], floor) ** 2)
         slopes.append(slope)
         weights.append(1.0 / error**2)
         lines.append((j, x, y, sigma))
@@ -265,6 +260,23 @@ def noise_model(
         found = float(np.average(y - variance * x, weights=1 / s**2))
         at_rest[j] = math.sqrt(max(found, floor**2, rounding[j] ** 2))
     return NoiseModel(at_rest, math.sqrt(variance))
+
+
+def _line(
+    x: FloatArray, y: FloatArray, share: float, more: float, least: float
+) -> tuple[float, float, FloatArray]:
+    """Return the slope of a line through variances, its standard error, and the variances' uncertainty, (n,).
+
+    That is a share of the line's own variance, which is at least ``least``, and ``more``. Weights by what
+    each bin has found would prefer those that found too little.
+    """
+    line = y
+    for _ in range(REWEIGHTED):
+        sigma = share * line + more
+        slope, error = _slope(x, y, sigma)
+        rise = max(slope, 0.0) * x
+        line = np.maximum(np.average(y - rise, weights=1 / sigma**2) + rise, least)
+    return slope, error, sigma
 
 
 def _slope(x: FloatArray, y: FloatArray, sigma: FloatArray) -> tuple[float, float]:

@@ -39,7 +39,7 @@ from deal_hw.calib.validation.cross_validation import Choice, fold_masks
 from deal_hw.calib.validation.explain import RIVAL, applicable
 from deal_hw.calib.validation.explanations import LAG, Explanation, values_in_words
 from deal_hw.calib.validation.wider_models import NOTICED
-from deal_hw.calibration import LATENCY, CalibrationResult, listed, percent
+from deal_hw.calibration import LATENCY, CalibrationResult, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
@@ -102,7 +102,7 @@ class LawCandidate:
         return Finding.alarm(
             f"With {law.name} ({values}) the error of predicted motions that were left out is {lower} lower.",
             law.means,
-            law.taken.replace("{}", listed([p.name for p in self.more])),
+            law.taken_as([p.name for p in self.more]),
         )
 
     def facts(self, choice: LawfulChoice, theta: FloatArray) -> dict[str, Any]:

@@ -34,7 +34,6 @@ from deal_hw.calib.validation.explanations import (
 )
 from deal_hw.calib.validation.signatures import Signature
 from deal_hw.calib.validation.wider_models import WiderFit, wider_cost
-from deal_hw.calibration import listed
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
@@ -53,7 +52,7 @@ class LawsOnDelays:
 
     Attributes:
         run: The calibration of the recordings with the laws, without the delays.
-        late: The fit.
+        late: The fit, with linearised residuals.
         laws: The laws, as causes, by their names.
         shifts: Where the values would go, in their scales, and the latency [s], (K + 1,), with each law that
             gains something, though no more than chance does: it may be there.
@@ -79,7 +78,7 @@ class LawsOnDelays:
 
 def laws_on_delays(run: CalibrationRun, late: DelayFit) -> LawsOnDelays:
     """Return a fit with delays of single commands with the laws that it shows on top of them."""
-    found = LawsOnDelays(run, late)
+    found = LawsOnDelays(run, dataclasses.replace(late, fit=with_rows(late.fit)))
     while True:
         with run.check(EXPLANATIONS):
             wider, effects = _with_a_law(found)
@@ -94,9 +93,12 @@ def _with_a_law(before: LawsOnDelays) -> tuple[LawsOnDelays | None, list[tuple[f
 
     What each law gains by its linearised effect follows, with where the values go then.
     """
-    problem, fit = before.late.problem, with_rows(before.late.fit)
-    can = {each: more for each, more in applicable(problem).items() if before.run.takes(each)}
-    can = {each: more for each, more in can.items() if each.name not in before.laws}
+    problem, fit = before.late.problem, before.late.fit
+    can = {
+        each: more
+        for each, more in applicable(problem).items()
+        if before.run.takes(each) and each.name not in before.laws
+    }
     if not can:
         return None, []
     seen = evidence(problem, fit, answered=False)
@@ -132,7 +134,7 @@ def _taken(
     law = _cause(wide, fit, best, rivals)
     if law.deviance <= EVIDENCE:
         return None
-    late = dataclasses.replace(before.late, problem=wide.fit.shooting.problem, fit=wide.fit)
+    late = dataclasses.replace(before.late, problem=wide.fit.shooting.problem, fit=with_rows(wide.fit))
     of = dataclasses.replace(run, problem=run.problem.with_more(wide.more))
     return LawsOnDelays(of, late, {**before.laws, best.name: law})
 
@@ -166,13 +168,10 @@ def _cause(wide: WiderFit, fit: Refined, law: Explanation, rivals: Sequence[str]
     """Return a law that the result has as a cause of the residual; ``fit`` is without it."""
     before, after = fit.chi2, wide.fit.chi2
     values = values_in_words(wide.more, list(map(float, wide.found)))
-    do = law.taken.replace("{}", listed([p.name for p in wide.more]))
-    if rivals:
-        do += f" Recordings like these do not tell it from {listed(list(rivals))}."
     alarm = Finding.alarm(
         f"With {law.name} ({values}) the fit leaves a chi2 of {after:.3g} instead of {before:.3g}.",
         law.means,
-        do,
+        law.taken_as([p.name for p in wide.more], rivals),
     )
     deviance = fit.normal.count * float(np.log(before / after))
     elements = tuple(dict.fromkeys(e for p in wide.more for e in p.elements))

@@ -63,7 +63,6 @@ from deal_hw.calibration import (
     Progress,
     ProgressCallback,
     StateStore,
-    listed,
 )
 from deal_hw.findings import Finding
 
@@ -498,11 +497,8 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         return None
     # The model's own values are somebody's best guess, so of those that explain alike the nearest is taken.
     (best, fit, wide), *others = sorted(exact, key=lambda each: each[0].change)
-    do = best.explanation.taken.replace("{}", listed(best.added))
     names = [one.explanation.name for one, *_ in others]
-    if others:
-        do += f" Recordings like these do not tell it from {listed(names)}."
-    alarm = dataclasses.replace(best.diagnosis, do=do)
+    alarm = dataclasses.replace(best.diagnosis, do=best.explanation.taken_as(best.added, names))
     run.say(BEFORE_SEARCH, str(alarm))
     rows = law_candidates(run.tried, found, best.explanation.name, names)
     outcome = conclude_fit(wide, searched, fit)

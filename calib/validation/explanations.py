@@ -81,6 +81,14 @@ class Explanation:
     taken: str
     in_mjcf: bool = False
 
+    def taken_as(self, names: Sequence[str], rivals: Sequence[str] = ()) -> str:
+        """Return what to do where the result has it as these parameters.
+
+        ``rivals`` are the names of others that explain the recordings alike.
+        """
+        do = self.taken.replace("{}", listed(list(names)))
+        return do + f" Recordings like these do not tell it from {listed(list(rivals))}." if rivals else do
+
 
 def _friction(problem: Problem) -> list[Parameter]:
     return _at_zero(problem, "dof_frictionloss")

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import uncertainty_at
+from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.pipeline import laws_on_delays, stages
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
@@ -299,7 +299,7 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
 ) -> None:
     """Delays end the calibration where they leave only noise and nothing is found that is worse."""
     run, suspicion, _ = suspected
-    fit = at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40)
+    fit = with_rows(at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40))
     late = DelayFit(run.problem, dataclasses.replace(fit, chi2=1.0), RandomDelay(99.0, 99.0, 0.5, 1e-3), fit)
     monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: late)
     monkeypatch.setattr(stages, "conclusive", lambda problem, fit: fit.chi2 < 1.3)
