@@ -40,6 +40,7 @@ LAWS: dict[str, dict[str, float]] = {
     "transmission": SPRING,
     "play": SPRING | {"transmission_play": 0.01},
     "encoder-at-motor": SPRING | {"encoder_at_motor": 1.0},
+    "friction-at-motor": SPRING | {"friction_at_motor": 1.0},
 }
 """Parameters of each law: kinds and their values."""
 EVERY = 10

@@ -46,13 +46,22 @@ TRUE = {"stiffness": 80.0, "damping": 0.15}
 """Of the transmission."""
 
 
-def recording(play: float, seconds: float, seed: int = 1, *, at_motor: bool = False) -> dict[str, np.ndarray]:
+def recording(
+    play: float, seconds: float, seed: int = 1, *, at_motor: bool = False, friction: float = 0.0
+) -> dict[str, np.ndarray]:
     """Return time, position and command of an arm whose servo is damped at its motor.
 
-    Its encoder, which the servo and the recording read, is at the link or at the motor.
+    Its encoder, which the servo and the recording read, is at the link or at the motor. Where the motor has
+    dry friction [N·m], the joint's damping is the motor's, too.
     """
     ends = {"low": -play / 2, "high": play / 2}
     text = TWO_BODIES.format(link=LINK, rotor=ROTOR, joint=0.08, **TRUE, **ends)
+    if friction:
+        # A constraint that creeps little.
+        rubbing = f'damping="0.08" frictionloss="{friction}" solimpfriction="0.99 0.9999 0.001 0.5 2"'
+        text = text.replace('damping="0.08"', "").replace(
+            f'armature="{ROTOR}"', f'armature="{ROTOR}" {rubbing}'
+        )
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     rng = np.random.default_rng(seed)
@@ -150,6 +159,23 @@ def test_a_spring_is_recovered_by_an_encoder_at_the_motor(tmp_path: Path) -> Non
     found, latency_s = fitted(wrong)
     assert found["transmission_stiffness"] > 3 * TRUE["stiffness"]
     assert held_out_rms(wrong, found, latency_s) > 20 * error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at_motor", [False, True], ids=["encoder at link", "encoder at motor"])
+def test_friction_of_a_motor_is_recovered(tmp_path: Path, at_motor: bool) -> None:
+    """0.15 N·m, beside spring and damping; held to be at the link, it comes out otherwise, and so does k."""
+    recorded = recording(0.0, 4.0, at_motor=at_motor, friction=0.15)
+    searched = SEARCHED | {"dof_frictionloss": "nominal: 0.05, range: [0.01, 0.5]"}
+    searched |= AT_MOTOR if at_motor else {}
+    at_the_motor = {"friction_at_motor": "known: true"}
+    found, _ = fitted(calibration_problem(tmp_path, recorded, searched | at_the_motor))
+    assert found["dof_frictionloss"] == pytest.approx(0.15, rel=0.03)
+    assert found["transmission_stiffness"] == pytest.approx(TRUE["stiffness"], rel=0.02)
+    assert found["dof_damping"] == pytest.approx(0.08, rel=0.05)
+    wrong, _ = fitted(calibration_problem(tmp_path, recorded, searched))
+    assert wrong["dof_frictionloss"] < 0.93 * 0.15
+    assert abs(wrong["transmission_stiffness"] / TRUE["stiffness"] - 1) > 0.03
 
 
 @pytest.mark.slow

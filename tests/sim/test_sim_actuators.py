@@ -54,6 +54,7 @@ def calibrated(tmp_path: Path, members: ServoBatch) -> mujoco.MjModel:
             "servo_punch": 0.1,
             "dof_friction_load": 0.1,
         },
+        {"transmission_stiffness": 60.0, "transmission_play": 0.01, "friction_at_motor": 1.0},
         {"servo_resolution": 0.01, "servo_speed_limit": 1.0, "encoder_bias": 0.05},
         {"servo_speed_limit": 1.0, "command_delay": 0.005, "encoder_scale": 1.1, "encoder_bias": 0.05},
     ],

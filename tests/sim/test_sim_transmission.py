@@ -9,6 +9,18 @@ import mujoco
 import numpy as np
 import pytest
 from fakes.law_robots import GEARED, MOTOR, SERVO, batch, known, robot, swing
+from fakes.sprung_loop import (
+    LINK,
+    PENDULUM,
+    POSITION,
+    ROTOR,
+    TORQUE,
+    TWO_BODIES,
+    SprungLoop,
+    coupled,
+    plate,
+    transmission_law,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,112 +28,20 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop
-from deal_hw.sim.engine.step_laws import StepLaws
-from deal_hw.sim.engine.transmission import Transmissions, take_constant_torques
 from deal_hw.sim.engine.warp_support import choose_engine
-from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
 from deal_hw.sim.parameters import check_space
-from deal_hw.sim.parameters.fields import ModelFields
 from deal_hw.types import FloatArray
-
-ROTOR, LINK = 0.02, 0.01
-"""Inertias of the plate's motor and of the plate [kg·m²]: 1.5 kg / 3 (0.1² + 0.1²) m²."""
-
-PLATE = """
-<mujoco><option timestep="{step}" integrator="{integrator}" gravity="0 0 0"/><worldbody>
-<body><joint name="plate" axis="0 1 0" armature="0.02"/><geom type="box" size=".1 .01 .1" mass="1.5"/></body>
-</worldbody><actuator><motor name="plate" joint="plate"/></actuator></mujoco>"""
-
-PENDULUM = """
-<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
-<body><joint name="arm" axis="0 1 0" armature="0.02" damping="0.2"/>
-<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4"/></body>
-</worldbody><actuator>{actuator}</actuator></mujoco>"""
-
-TORQUE = '<motor name="arm" joint="arm"/>'
-POSITION = '<position name="arm" joint="arm" kp="{kp}" kv="0.6" forcerange="-2 2"/>'
-
-TWO_BODIES = """
-<mujoco><option timestep="0.0001" integrator="implicitfast"/><worldbody>
-<body><joint name="arm" axis="0 1 0" damping="0.2"/>
-<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4"/></body>
-<body><joint name="rotor" axis="0 1 0" armature="0.02"/><geom size=".01" mass="1e-6"/></body>
-</worldbody><tendon><fixed stiffness="{stiffness}" damping="{damping}" springlength="{low} {high}">
-<joint joint="rotor" coef="1"/><joint joint="arm" coef="-1"/></fixed></tendon>
-<actuator><motor name="rotor" joint="rotor"/></actuator></mujoco>"""
-
-
-class Loop:
-    """One model in a loop of mj_step with the laws between the steps."""
-
-    def __init__(self, text: str, *, at_motor: bool = False, **kinds: float) -> None:
-        model = self.model = mujoco.MjModel.from_xml_string(text)
-        self.data = mujoco.MjData(model)
-        name = model.actuator(0).name
-        take_constant_torques(model, [name])
-        values = {f"transmission_{kind}": [(name, np.array([value]))] for kind, value in kinds.items()}
-        if at_motor:
-            values["encoder_at_motor"] = [(name, np.ones(1))]
-        laws = StepLaws.of(ModelFields(model, model), lambda field: getattr(self.data, field)[None], values)
-        assert laws is not None and laws.transmissions is not None
-        self._laws, self.rotor = laws, laws.transmissions
-        self._begun = False
-
-    def begin(self) -> Transmissions:
-        """Let the rotor's state follow from the link's; return it."""
-        self._laws.begin(lambda: mujoco.mj_forward(self.model, self.data))
-        self._begun = True
-        return self.rotor
-
-    def step(self, control: float) -> None:
-        """Do one step."""
-        self.data.ctrl[0] = control
-        if not self._begun:
-            self.begin()
-        self._laws.write()
-        mujoco.mj_step(self.model, self.data)
-        self._laws.follow()
-
-
-def plate(stiffness: float, step: float = 0.002, integrator: str = "implicitfast", **kinds: float) -> Loop:
-    """Return the plate without gravity."""
-    text = PLATE.format(step=step, integrator=integrator)
-    return Loop(text, at_motor=False, stiffness=stiffness, **kinds)
-
-
-def law(**parts: float) -> TransmissionLaw:
-    """Return the law of one joint with a step of 1 ms."""
-    every = {"stiffness": 100.0, "damping": 0.0, "play": 0.0, "inertia": 0.02, "link_inertia": 0.01} | parts
-    return TransmissionLaw(**{name: np.array([[value]]) for name, value in every.items()}, step_s=0.001)
-
-
-def coupled(of: TransmissionLaw, *state: float, stiffness: float = 0.0) -> list[float]:
-    """Return torque, inertia, own speed and the share that follows, of one joint.
-
-    Args:
-        of: Its law.
-        state: Deflection, speeds of the motor and of the link, torque, and what it loses with the speed.
-        stiffness: What it loses with the motor's angle.
-    """
-    *now, resistance = (np.array([[value]]) for value in state)
-    couplings = Couplings(of, resistance, np.array([[stiffness]]))
-    torque, _ = couplings.couple(np.stack(now))
-    own_speed, moving = np.empty((1, 1)), np.empty((1, 1))
-    couplings.follow(np.zeros((1, 1)), own_speed)
-    couplings.follow(np.ones((1, 1)), moving)
-    parts = torque, couplings.inertia, own_speed, moving - own_speed
-    return [float(part[0, 0]) for part in parts]
 
 
 def test_a_soft_spring_by_hand() -> None:
     """100 N·m/rad, bent by 0.03 rad: 3 N·m; the rotor, 1 rad/s, loses 3 N·m and gains 2 N·m for 1 ms."""
     speed = 1.0 + (2.0 - 3.0) * 0.001 / 0.02
-    assert coupled(law(), 0.03, 1.0, 0.5, 2.0, 0.0) == pytest.approx([3.0, 0.0, speed, 0.0])
+    assert coupled(transmission_law(), 0.03, 1.0, 0.5, 2.0, 0.0) == pytest.approx([3.0, 0.0, speed, 0.0])
 
 
 def test_a_damper_by_hand() -> None:
     """0.5 N·m·s/rad, half of it at the end: the rotor, 0.02 kg·m² in 1 ms, is 20, so 0.25/20.25 follow."""
-    torque, inertia, speed, follows = coupled(law(damping=0.5), 0.03, 1.0, 0.5, 2.0, 0.0)
+    torque, inertia, speed, follows = coupled(transmission_law(damping=0.5), 0.03, 1.0, 0.5, 2.0, 0.0)
     assert follows == pytest.approx(0.25 / 20.25)
     # The spring's 3 N·m and half of the damper's 0.5 (1 - 0.5) N·m are those at the beginning.
     push = 3.0 + 0.25 * (1.0 - 0.5)
@@ -133,23 +53,25 @@ def test_a_damper_by_hand() -> None:
 def test_a_motors_resistance_by_hand() -> None:
     """4 N·m·s/rad, half of it at the end: 22 w' = 18 w + 2 N·m less the spring's 3 N·m."""
     speed = (18.0 * 1.0 + 2.0 - 3.0) / 22.0
-    assert coupled(law(), 0.03, 1.0, 0.5, 2.0, 4.0) == pytest.approx([3.0, 0.0, speed, 0.0])
+    assert coupled(transmission_law(), 0.03, 1.0, 0.5, 2.0, 4.0) == pytest.approx([3.0, 0.0, speed, 0.0])
 
 
 def test_a_strong_damper_does_not_ring() -> None:
     """200 N·m·s/rad on a rotor of 20: a tenth counts at the beginning, and it stops in one step."""
-    assert coupled(law(), 0.0, 1.0, 0.0, 0.0, 200.0) == pytest.approx([0.0, 0.0, 0.0, 0.0])
+    assert coupled(transmission_law(), 0.0, 1.0, 0.0, 0.0, 200.0) == pytest.approx([0.0, 0.0, 0.0, 0.0])
 
 
 def test_a_stiff_servo_at_the_motor_by_hand() -> None:
     """4e4 N·m/rad on 0.02 kg·m²: twice what 1 ms bears, so half a step of it, 20 N·m·s/rad, is at the end."""
     speed = (20.0 * 1.0 + 2.0 - 3.0) / (20.0 + 4e4 * 0.001 / 2)
-    assert coupled(law(), 0.03, 1.0, 0.5, 2.0, 0.0, stiffness=4e4) == pytest.approx([3.0, 0.0, speed, 0.0])
+    assert coupled(transmission_law(), 0.03, 1.0, 0.5, 2.0, 0.0, stiffness=4e4) == pytest.approx(
+        [3.0, 0.0, speed, 0.0]
+    )
 
 
 def test_a_stiff_spring_adds_the_rotor_to_the_link() -> None:
     """1e9 N·m/rad: the link has 0.02 kg·m² more, and 1 ms of the motor's 3 N·m·s/rad."""
-    torque, inertia, speed, follows = coupled(law(stiffness=1e9), 0.0, 0.5, 0.5, 2.0, 3.0)
+    torque, inertia, speed, follows = coupled(transmission_law(stiffness=1e9), 0.0, 0.5, 0.5, 2.0, 3.0)
     assert inertia == pytest.approx(0.02 + 0.003, rel=1e-4)
     assert torque == pytest.approx(2.0 - 3.0 * 0.5, rel=1e-4)
     assert [speed, follows] == pytest.approx([0.0, 1.0], abs=1e-4)
@@ -157,7 +79,7 @@ def test_a_stiff_spring_adds_the_rotor_to_the_link() -> None:
 
 def test_a_gap_by_hand() -> None:
     """A gap of 0.04 rad: nothing at 0.019 rad, 100 N·m/rad beyond 0.02 rad to either side."""
-    of = law(play=0.04)
+    of = transmission_law(play=0.04)
     assert coupled(of, 0.019, 1.0, 0.0, 2.0, 0.0) == pytest.approx([0.0, 0.0, 1.1, 0.0])
     assert coupled(of, 0.05, 0.0, 0.0, 0.0, 0.0)[0] == pytest.approx(3.0)
     assert coupled(of, -0.05, 0.0, 0.0, 0.0, 0.0)[0] == pytest.approx(-3.0)
@@ -167,7 +89,7 @@ def test_a_gap_by_hand() -> None:
 @pytest.mark.parametrize("play", [0.0, 0.05])
 def test_deflection_at_rest_is_torque_over_stiffness(play: float) -> None:
     """A pendulum of 0.4 kg, 0.15 m, held by 0.3 N·m at 20 N·m/rad: 0.015 rad, and half of the gap."""
-    loop = Loop(PENDULUM.format(actuator=TORQUE), stiffness=20.0, damping=0.1, play=play)
+    loop = SprungLoop(PENDULUM.format(actuator=TORQUE), stiffness=20.0, damping=0.1, play=play)
     for _ in range(5000):
         loop.step(0.3)
     link = float(loop.data.qpos[0])
@@ -236,7 +158,7 @@ def test_motion_is_that_of_two_bodies(
     stiffness: float, damping: float, play: float, tolerance: float
 ) -> None:
     """MuJoCo's own rotor, link and tendon at 0.1 ms, under the same torques, within a share of the motion."""
-    loop = Loop(PENDULUM.format(actuator=TORQUE), stiffness=stiffness, damping=damping, play=play)
+    loop = SprungLoop(PENDULUM.format(actuator=TORQUE), stiffness=stiffness, damping=damping, play=play)
     ends = {"low": -play / 2, "high": play / 2}
     model = mujoco.MjModel.from_xml_string(TWO_BODIES.format(stiffness=stiffness, damping=damping, **ends))
     data = mujoco.MjData(model)
@@ -257,7 +179,7 @@ def test_motion_is_that_of_two_bodies(
 def test_a_servo_reads_its_encoder_and_is_damped_at_the_motor(limit: float, at_motor: bool) -> None:
     """Two bodies: 15 N·m/rad of the error, 0.6 N·m·s/rad of the motor's speed, then the limit."""
     text = POSITION.format(kp=15).replace("-2 2", f"-{limit} {limit}")
-    loop = Loop(PENDULUM.format(actuator=text), at_motor=at_motor, stiffness=60.0, damping=0.05)
+    loop = SprungLoop(PENDULUM.format(actuator=text), at_motor=at_motor, stiffness=60.0, damping=0.05)
     model = mujoco.MjModel.from_xml_string(TWO_BODIES.format(stiffness=60, damping=0.05, low=0, high=0))
     data = mujoco.MjData(model)
     found, expected = np.empty((2, 800)), np.empty((2, 800))
@@ -287,7 +209,7 @@ def test_no_servo_that_reads_its_motor_blows_up(
     """From 0.2 rad beside its goal without any damping, the motor never goes much further from it."""
     text = PENDULUM.replace("0.02", f"{rotor}", 1).format(actuator=POSITION.format(kp=gain))
     text = text.replace('kv="0.6" forcerange="-2 2"', "")
-    loop = Loop(text, at_motor=True, stiffness=stiffness, play=play)
+    loop = SprungLoop(text, at_motor=True, stiffness=stiffness, play=play)
     loop.data.qpos[0] = 0.2
     for _ in range(300):
         loop.step(0.0)
@@ -383,13 +305,17 @@ def sprung(
     )
 
 
-@pytest.mark.parametrize("at_motor", [False, True], ids=["at link", "at motor"])
+@pytest.mark.parametrize(
+    "facts",
+    [(), ("encoder_at_motor",), ("friction_at_motor",), ("encoder_at_motor", "friction_at_motor")],
+    ids=["at link", "encoder at motor", "friction at motor", "both at motor"],
+)
 @pytest.mark.parametrize(("text", "name"), [(SERVO, "shoulder"), (MOTOR, "wheel")], ids=["servo", "motor"])
 def test_a_window_does_not_depend_on_the_one_before(
-    tmp_path: Path, text: str, name: str, at_motor: bool
+    tmp_path: Path, text: str, name: str, facts: tuple[str, ...]
 ) -> None:
     """States that are set anew have rotors that follow from them, also in windows and with new values."""
-    more = [known("encoder_at_motor", name, 1.0)] if at_motor else []
+    more = [known(fact, name, 1.0) for fact in facts]
     members = sprung(tmp_path, 2, text, name, *more)
     joints = 2 if text == SERVO else 1
     start, path = np.full(joints, 0.2), np.repeat(swing(200, joints), 2, axis=0)
@@ -498,6 +424,7 @@ def searched_place() -> Parameter:
 
 
 STIFF = ("transmission_stiffness", "shoulder", 100.0)
+RUBS = ("friction_at_motor", "shoulder", 1.0)
 
 
 @pytest.mark.parametrize(
@@ -522,6 +449,12 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
         ),
         (SERVO, space(AT_MOTOR), r"'shoulder' has no elastic transmission.*add transmission_stiffness"),
         (SERVO, space(STIFF, searched_place()), r"is searched, and the place.*`known: true`"),
+        (SERVO, space(STIFF, (*RUBS[:2], 2.0)), r"is 2, and the place of friction.*`known: true`"),
+        (
+            SERVO,
+            space(STIFF, RUBS, ("dof_friction_load", "shoulder", 1.0)),
+            r"dof_friction_load.*at the link.*'shoulder' is at the motor.*leave one out",
+        ),
         (SERVO, space(STIFF, (*AT_MOTOR[:2], 2.0)), r"is 2, and the place.*`known: true`"),
         (SERVO.replace("implicitfast", "RK4"), space(STIFF), r"RK4 changes the torque of a.*Euler"),
         (
@@ -540,7 +473,9 @@ STIFF = ("transmission_stiffness", "shoulder", 100.0)
             r"2 actuators \('shoulder', 'elbow'\).*one",
         ),
     ],
-    ids="bare,rotor of 0,play,effort,no spring,rigid,searched,no fact,RK4,own rotor,limit,two".split(","),
+    ids=(
+        "bare,rotor of 0,play,effort,no spring,rigid,searched,rubs,rubs twice,no fact,RK4,own rotor,limit,two"
+    ).split(","),
 )
 def test_what_cannot_be_is_refused(text: str, parameters: ParameterSpace, message: str) -> None:
     """With what is allowed, and what to do."""

@@ -4,7 +4,8 @@ A joint's ``dof_armature`` is the rotor's inertia. It is taken out of the model,
 and a speed of its own. The actuator's gains, constant effort and limit give the motor's torque: from the
 position where the encoder is, of the link or of the motor, and the speed of the motor. In the model the
 actuator is a constant torque, which is written before each step, and the armature is what the link feels of
-the rotor. So ``qfrc_actuator`` is what the transmission passes.
+the rotor. So ``qfrc_actuator`` is what the transmission passes. Where friction is at the motor, the joint's
+dry friction and damping are taken out of the model, too.
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.gpu import EngineName
 from deal_hw.sim.laws.motor import effort_range
-from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
+from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw, within
 from deal_hw.sim.parameters.fields import Fields, as_slice, element_id
 from deal_hw.sim.parameters.laws import FREE_SPEED
 from deal_hw.sim.parameters.transmission import (
     ENCODER_AT_MOTOR,
+    FRICTION_AT_MOTOR,
     TRANSMISSION_DAMPING,
     TRANSMISSION_PLAY,
     TRANSMISSION_STIFFNESS,
@@ -34,6 +36,9 @@ from deal_hw.types import FloatArray
 Outputs = Callable[[str], FloatArray]
 
 Mask = npt.NDArray[np.bool_]
+
+_RUBS = ("dof_frictionloss", "dof_damping")
+"""What of a joint acts on the motor where its friction is there."""
 
 _FIELDS = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange")
 
@@ -98,6 +103,9 @@ class Transmissions:
         # Transmissions with the encoder at the motor, (B,), and where their joints have positions and speeds.
         turned = {name for name, _ in values.get(ENCODER_AT_MOTOR, ())}
         self._turned = np.array([model.joint(int(j)).name in turned for j in joint])
+        # Those whose joints' friction is at the motor, (B,).
+        rubbing = {name for name, _ in values.get(FRICTION_AT_MOTOR, ())}
+        self._rubbing = np.array([model.joint(int(j)).name in rubbing for j in joint])
         self.at_motor = bool(self._turned.any())
         dof, place = model.jnt_dofadr[joint].tolist(), model.jnt_qposadr[joint].tolist()
         self._actuator, self._dof, self._place = as_slice(actuator), as_slice(dof), as_slice(place)
@@ -109,6 +117,8 @@ class Transmissions:
         self._control, self._torque, self._qacc = outputs("ctrl"), outputs("qfrc_actuator"), outputs("qacc")
         self._gain, self._bias, self._range = (fields.get(name) for name in _FIELDS)
         self._armature = fields.get("dof_armature")
+        self._rubs = [fields.get(name) for name in _RUBS]
+        self._rubbing_dof = np.array(dof)[self._rubbing]
         # MuJoCo takes the inertia of a body that moves alone ("simple") as it was derived, with the armature.
         self._simple = np.flatnonzero(np.array(model.dof_simplenum)[dof] > 0)
         self._simple_dof = [dof[k] for k in self._simple]
@@ -123,6 +133,11 @@ class Transmissions:
             return np.stack([found.get(name, np.zeros(shape[0])) for name in names], axis=1)
 
         rotor = self._armature[:, self._dof].copy()
+        # Dry friction and damping of the joints that act on the motors, (N, B) each.
+        self._friction, self._damping = (
+            np.where(self._rubbing, field[:, self._dof], 0.0) for field in self._rubs
+        )
+        self._constraint = outputs("qfrc_constraint")
         # The inertia at the joint in the model's first pose, with all other joints free.
         whole = 1 / fields.get("dof_invweight0")[:, self._dof]
         self.law = TransmissionLaw(
@@ -174,7 +189,7 @@ class Transmissions:
         self._per_control, self._constant = self._gear * gain, self._gear * bias[..., 0]
         self._per_position, self._resistance = (-(self._gear**2) * bias[..., k] for k in (1, 2))
         own = np.where(self._turned, self._per_position, 0.0)
-        self._couplings = Couplings(self.law, self._resistance, own)
+        self._couplings = Couplings(self.law, self._resistance, own, self._friction, self._damping)
         self._write_motors(np.zeros(len(self.fresh), dtype=bool))
 
     def restore_sent(self) -> None:
@@ -188,6 +203,8 @@ class Transmissions:
         for field, own in zip((self._gain, self._bias, self._range), self._nominal, strict=True):
             field[:, at] = own
         self._armature[:, self._dof] = self._model.dof_armature[self._dof]
+        for name, field in zip(_RUBS, self._rubs, strict=True):
+            field[:, self._rubbing_dof] = getattr(self._model, name)[self._rubbing_dof]
 
     def _write_motors(self, rows: npt.NDArray[np.bool_]) -> None:
         """Write the motors as they are in the members of ``rows``, (N,), and transmissions in the others."""
@@ -198,12 +215,18 @@ class Transmissions:
         self._bias[:, at, 0] = np.where(there, bias[..., 0], self._passed / self._gear)
         self._range[:, at] = np.where(there[..., None], limits, (-np.inf, np.inf))
         self._put_inertia(np.where(there, self.law.inertia, self._couplings.inertia))
+        self._put_friction(there)
 
     def _put_inertia(self, inertia: FloatArray) -> None:
         """Write what the links have beside their own inertia, (N, B)."""
         self._armature[:, self._dof] = inertia
         if self._simple_dof:
             self._derived[:, self._simple_dof] = self._alone + inertia[:, self._simple]
+
+    def _put_friction(self, rows: npt.NDArray[np.bool_]) -> None:
+        """Write motors' friction as their joints' in the members of ``rows``, (N, 1), and 0 in the others."""
+        for field, own in zip(self._rubs, (self._friction, self._damping), strict=True):
+            field[:, self._rubbing_dof] = np.where(rows, own[:, self._rubbing], 0.0)
 
     def begin(self, forward: Callable[[], None], served: list[int]) -> None:
         """Set the states of fresh rotors: they move with their links, and their springs pass what is needed.
@@ -227,6 +250,8 @@ class Transmissions:
         # Members that go on pass the torque of their last step.
         self._bias[:, self._actuator, 0] = np.where(rows, acting, self._passed) / self._gear
         self._put_inertia(np.where(rows, self.law.inertia, self._couplings.inertia))
+        # Rotors and links of fresh members move as one, so that friction holds both.
+        self._put_friction(rows)
         bent = self._bent(forward)
         if self.at_motor:
             at, motors = self._reported["qpos"], self._turned
@@ -242,7 +267,11 @@ class Transmissions:
     def _bent(self, forward: Callable[[], None]) -> FloatArray:
         """Return how far transmissions bend that move rotors and links as one in this state, (N, B)."""
         forward()
-        return self.law.deflection(self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof])
+        passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
+        # What friction takes from the motor does not pass the spring. A constraint beyond it is the link's.
+        passed = passed + within(self._constraint[:, self._dof], self._friction)
+        passed -= self._damping * self._qvel[:, self._dof]
+        return self.law.deflection(passed)
 
     def report(self, name: str, values: FloatArray) -> None:
         """Put what encoders at motors measure into positions or speeds of the simulations.

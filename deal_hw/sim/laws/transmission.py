@@ -32,6 +32,11 @@ the spring's. The roots of a step lie within the unit circle for
 A servo whose encoder is at the motor pulls the rotor to its goal as a spring of its stiffness kp does. That
 spring has a share of its own, ``max(0, 1 - J / (h² kp))``, so that a light rotor and a stiff servo do not
 blow up either.
+
+Dry friction f of the motor adds ``-f sign(m')`` to its torque, or as much as holds it at rest. Whether it
+slides follows from its speed at the end of the step without friction, if the link keeps its own speed: it
+holds where f would turn that round. A motor that is held is the fixed end of the link's spring. Most friction
+of a geared motor is before its play, where it does not hold the link.
 """
 
 from __future__ import annotations
@@ -134,6 +139,11 @@ class TransmissionLaw:
         return np.stack([*own, *torque, follows, self.step_s * felt, kept / rotor, 1 / rotor])
 
 
+def within(values: FloatArray, most: FloatArray) -> FloatArray:
+    """Return values limited to ``most`` to either side."""
+    return np.asarray(np.minimum(np.maximum(values, -most), most))
+
+
 class Couplings:
     """What links feel of their motors in each step, and how the motors follow them.
 
@@ -145,17 +155,29 @@ class Couplings:
         resistance: What the motors' torques lose with their speeds, c, (N, B) [N·m·s/rad or N·s/m].
         stiffness: What they lose with the motors' own angles, (N, B) [N·m/rad or N/m]; 0 for encoders at the
             links.
+        friction: Dry friction of the motors, (N, B) [N·m or N]; None for none.
+        damping: Damping of the motors themselves, which acts at their limits, too, (N, B) [N·m·s/rad or
+            N·s/m].
 
     Attributes:
         inertia: What the links have beside their own, (N, B) [kg·m² or kg].
     """
 
     def __init__(
-        self, law: TransmissionLaw, resistance: FloatArray, stiffness: FloatArray | float = 0.0
+        self,
+        law: TransmissionLaw,
+        resistance: FloatArray,
+        stiffness: FloatArray | float = 0.0,
+        friction: FloatArray | None = None,
+        damping: FloatArray | float = 0.0,
     ) -> None:
         self._law, shape = law, resistance.shape
+        self._friction = friction if friction is not None and np.any(friction) else None
+        # Of a spring whose motor stands still.
+        end = law.damper_share(0 * resistance)
+        self._damper, self._grip = (1 - end) * law.damping, law.stiffness * law.ahead_s + end * law.damping
         self._gapless = not np.any(law.play)
-        self._motors = law.factors(resistance, stiffness), law.factors(0 * resistance)
+        self._motors = law.factors(resistance + damping, stiffness), law.factors(0 * resistance + damping)
         self._nowhere: Mask = np.zeros(shape, dtype=bool)
         self._held = self._nowhere
         self._products, self._sums = np.zeros((2, 4, *shape)), np.zeros((2, *shape))
@@ -179,13 +201,15 @@ class Couplings:
         if changed:
             self._held = held
             self._act(np.where(held, self._motors[1], self._motors[0]))
-        if self._gapless:
+        if self._gapless and self._friction is None:
             self._add(state)
             return self._sums[1], changed
         deflection, motor_speed, link_speed, torque = state
         # Whether the gap is closed is asked of a rotor that nothing holds yet.
         free = self._kept * motor_speed
         free += self._free * torque
+        if self._friction is not None:
+            free -= within(free, self._free * self._friction)
         reached = free - link_speed
         reached *= self._law.ahead_s
         reached += deflection
@@ -193,13 +217,34 @@ class Couplings:
         closed = np.abs(reached) >= half
         deflection -= np.copysign(half, reached)
         self._add(state)
+        self._follows, self.inertia = self._fits
+        if self._friction is not None:
+            self._rub(state, self._friction)
         np.copyto(free, self._sums[0], where=closed)
         self._own = free
         # As numbers: a product with truth values costs three times as much. Gaps open and close all the time.
         fits = closed.astype(float)
         self._sums[1] *= fits
-        self._follows, self.inertia = self._fits[0] * fits, self._fits[1] * fits
+        self._follows, self.inertia = self._follows * fits, self.inertia * fits
         return self._sums[1], True
+
+    def _rub(self, state: FloatArray, friction: FloatArray) -> None:
+        """Let dry friction act on motors whose gaps are closed.
+
+        Whether a motor slides, and where to, is that of its speed at the end without friction, if the link
+        keeps its own. A motor that does not slide holds its end of the spring.
+        """
+        deflection, motor_speed, link_speed, _ = state
+        speeds, torques = self._factors[:, 3]
+        speed = self._sums[0] + self._follows * link_speed
+        slides = np.abs(speed) > speeds * friction
+        against = np.copysign(friction, speed)
+        spring = self._law.stiffness * deflection + self._damper * motor_speed
+        spring -= (self._damper + self._grip) * link_speed
+        self._sums[0] = np.where(slides, self._sums[0] - speeds * against, 0.0)
+        self._sums[1] = np.where(slides, self._sums[1] - torques * against, spring)
+        self._follows = np.where(slides, self._follows, 0.0)
+        self.inertia = np.where(slides, self.inertia, self._law.step_s * self._grip)
 
     def _add(self, state: FloatArray) -> None:
         """Add what closed gaps make of a state, (4, N, B)."""

@@ -1,6 +1,6 @@
 """Parameter kinds of elastic transmissions: stiffness, damping and play between a motor and its link.
 
-One is a fact: which side of the transmission the encoder measures.
+Two are facts: which side of the transmission the encoder measures, and on which side the joint rubs.
 
 Their equations are in :mod:`deal_hw.sim.laws.transmission`.
 """
@@ -17,12 +17,13 @@ from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.kind import Kind, joint_of, one_dof_joint
-from deal_hw.sim.parameters.laws import check_integrator
+from deal_hw.sim.parameters.laws import FRICTION_KINDS, check_integrator
 
 TRANSMISSION_STIFFNESS: Final = "transmission_stiffness"
 TRANSMISSION_DAMPING: Final = "transmission_damping"
 TRANSMISSION_PLAY: Final = "transmission_play"
 ENCODER_AT_MOTOR: Final = "encoder_at_motor"
+FRICTION_AT_MOTOR: Final = "friction_at_motor"
 
 _EFFORTS = ("effort_gain", "effort_bias", "effort_delay", "effort_noise")
 
@@ -72,8 +73,15 @@ def check_transmissions(model: Any, space: ParameterSpace) -> None:
         for kind, e in kinds
         if kind == TRANSMISSION_STIFFNESS
     }
-    for p in (p for p in space.parameters if p.kind == ENCODER_AT_MOTOR):
-        _check_encoder(p, joints)
+    for p in (p for p in space.parameters if p.kind in (ENCODER_AT_MOTOR, FRICTION_AT_MOTOR)):
+        _check_place(p, joints)
+    for joint in (e for kind, e in kinds if kind == FRICTION_AT_MOTOR):
+        for kind in (*FRICTION_KINDS, "dof_friction_creep"):
+            if (kind, joint) in kinds:
+                raise ConfigurationError(
+                    f"parameter {kinds[kind, joint].name!r} ({kind}) is of friction at the link, and that of "
+                    f"{joint!r} is at the motor ({kinds[FRICTION_AT_MOTOR, joint].name!r}); leave one out"
+                )
     for name in (e for kind, e in kinds if kind == TRANSMISSION_STIFFNESS):
         first = kinds[TRANSMISSION_STIFFNESS, name].name
         if ("servo_play", name) in kinds:
@@ -91,12 +99,13 @@ def check_transmissions(model: Any, space: ParameterSpace) -> None:
                 )
 
 
-def _check_encoder(p: Parameter, sprung: Collection[str]) -> None:
+def _check_place(p: Parameter, sprung: Collection[str]) -> None:
     if not p.known or p.nominal != 1.0:
         given = f"{p.nominal:g}" if p.known else "searched"
+        what = "an encoder" if p.kind == ENCODER_AT_MOTOR else "friction"
         raise ConfigurationError(
-            f"parameter {p.name!r} ({p.kind}) is {given}, and the place of an encoder is a fact; "
-            "write `known: true` for encoders at the motor, leave it out for those at the link"
+            f"parameter {p.name!r} ({p.kind}) is {given}, and the place of {what} is a fact; "
+            "write `known: true` where it is at the motor, leave it out where it is at the link"
         )
     for joint in p.elements:
         if joint not in sprung:
@@ -167,6 +176,20 @@ TRANSMISSION_KINDS = (
         along="the reported position is the motor's, before the elastic transmission; `known: true` only",
         apply=None,
         # No MJCF says it: the entry itself does.
+        baseline=lambda m, i: 1.0,
+        usable=one_dof_joint,
+        scale="linear",
+    ),
+    Kind(
+        name=FRICTION_AT_MOTOR,
+        element="joint",
+        quantity="friction_at_motor",
+        unit="-",
+        writes=(),
+        along="the joint's dry friction and damping act on the motor, before the elastic transmission; "
+        "`known: true` only",
+        apply=None,
+        # As with the encoder.
         baseline=lambda m, i: 1.0,
         usable=one_dof_joint,
         scale="linear",
