@@ -4,8 +4,9 @@ Random delays predict no sample, but they predict where the residual is large: e
 the change of its command. Any other model error looks like a random force of constant size, white or slow, or
 like delays that change slowly: dry friction that falls with speed holds the motion back where commands turn
 round, over many of them. All are Gaussian processes beside white noise. Random delays are found where the
-residual is likelier with them than with these alone. Then the fit is repeated with a delay of its own for
-each command; see :mod:`deal_hw.calib.fit.command_delays`.
+residual is likelier with them than with forces alone, and slow ones are not likelier still by more than
+chance: a robot can have both. Then the fit is repeated with a delay of its own for each command; see
+:mod:`deal_hw.calib.fit.command_delays`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from deal_hw.calib.fit.command_delays import (
     likely_std,
     moved_commands,
 )
-from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.validation.signatures import SignatureResponse, answers
@@ -74,7 +75,7 @@ class RandomDelay:
     Attributes:
         deviance: Gain in deviance over white noise.
         gain: Gain in deviance over white noise and random forces, beside these; 0 where delays that change
-            slowly are likelier.
+            slowly are likelier, beyond chance.
         share: Share of the residual's variance.
         std_s: Standard deviation of the delays [s].
     """
@@ -277,7 +278,7 @@ def random_delay(
     both, ratios, level = _fitted(residual, followed, [*forces, delay])
     return RandomDelay(
         deviance=noise - delays,
-        gain=without - both if both < rival else 0.0,
+        gain=without - both if both - rival < EVIDENCE else 0.0,
         share=float(ratios[-1] / (1 + ratios.sum())),
         std_s=float(np.sqrt(ratios[-1] * level / scale)),
     )

@@ -71,16 +71,27 @@ def test_random_forces_are_no_delays(slow: bool) -> None:
     assert found is not None and found.gain < 1
 
 
+def _slow(change: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return impulses by delays of 1 s that change over 0.1 s, as friction that falls with speed has them."""
+    apart = np.abs(np.subtract.outer(np.arange(SAMPLES), np.arange(SAMPLES))) * PERIOD_S
+    root = np.linalg.cholesky(np.exp(-apart / 0.1) + 1e-9 * np.eye(SAMPLES))
+    return np.asarray(change * (rng.standard_normal(change.shape) @ root.T))
+
+
 def test_delays_that_change_slowly_are_none() -> None:
-    """Friction that falls with speed is late at each reversal, over many commands: 0.1 s here."""
-
-    def slow(change: FloatArray, rng: np.random.Generator) -> FloatArray:
-        apart = np.abs(np.subtract.outer(np.arange(SAMPLES), np.arange(SAMPLES))) * PERIOD_S
-        root = np.linalg.cholesky(np.exp(-apart / 0.1) + 1e-9 * np.eye(SAMPLES))
-        return np.asarray(0.5 * change * (rng.standard_normal(change.shape) @ root.T))
-
-    found = random_delay(*_pushed(slow), PERIOD_S)
+    """Friction that falls with speed is late at each reversal, over many commands."""
+    found = random_delay(*_pushed(lambda change, rng: 0.5 * _slow(change, rng)), PERIOD_S)
     assert found is not None and found.gain == 0.0 and found.deviance > EVIDENCE
+
+
+def test_random_delays_are_found_beside_slow_ones() -> None:
+    """With both, slow ones alone are as likely as random ones alone: that is no reason against these."""
+
+    def both(change: FloatArray, rng: np.random.Generator) -> FloatArray:
+        return 0.25 * _slow(change, rng) + 0.5 * change * rng.standard_normal(change.shape)
+
+    found = random_delay(*_pushed(both), PERIOD_S)
+    assert found is not None and found.gain > EVIDENCE
 
 
 def test_random_delays_are_found_beside_a_random_force() -> None:
