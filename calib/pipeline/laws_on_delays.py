@@ -23,7 +23,7 @@ from deal_hw.calib.validation.candidates import Candidate
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_alike
 from deal_hw.calib.validation.evidence import Evidence, evidence
-from deal_hw.calib.validation.explain import applicable, screened, screened_effect, screened_gain
+from deal_hw.calib.validation.explain import FAR, Allows, applicable, screened, screened_effect, screened_gain
 from deal_hw.calib.validation.explanations import (
     ZERO_CAUSES,
     Explanation,
@@ -76,19 +76,26 @@ class LawsOnDelays:
         )
 
 
-def laws_on_delays(run: CalibrationRun, late: DelayFit) -> LawsOnDelays:
-    """Return a fit with delays of single commands with the laws that it shows on top of them."""
+def laws_on_delays(run: CalibrationRun, late: DelayFit, allows: Allows) -> LawsOnDelays:
+    """Return a fit with delays of single commands with the laws that it shows on top of them.
+
+    Around a poor fit their effects say nothing, so there are none, and none where causes are not asked for.
+    ``allows`` says which fits may be made.
+    """
     found = LawsOnDelays(run, dataclasses.replace(late, fit=with_rows(late.fit)))
-    while True:
+    while run.settings.diagnosis and late.fit.chi2 <= FAR:
         with run.check(EXPLANATIONS):
-            wider, effects = _with_a_law(found)
+            wider, effects = _with_a_law(found, allows)
         if wider is None:
             unsure = tuple(shift for gain, shift in effects if 0 < gain <= EVIDENCE)
             return dataclasses.replace(found, shifts=unsure)
         found = wider
+    return found
 
 
-def _with_a_law(before: LawsOnDelays) -> tuple[LawsOnDelays | None, list[tuple[float, FloatArray]]]:
+def _with_a_law(
+    before: LawsOnDelays, allows: Allows
+) -> tuple[LawsOnDelays | None, list[tuple[float, FloatArray]]]:
     """Return the fit with one more law; None where no law gains.
 
     What each law gains by its linearised effect follows, with where the values go then.
@@ -108,7 +115,7 @@ def _with_a_law(before: LawsOnDelays) -> tuple[LawsOnDelays | None, list[tuple[f
         each: screened_effect(seen, effects[each], one_sided(problem, more)) for each, more in can.items()
     }
     gains = {each: gain for each, (gain, _) in screen.items()}
-    return _taken(before, seen, effects, can, gains), list(screen.values())
+    return _taken(before, seen, effects, can, gains, allows), list(screen.values())
 
 
 def _taken(
@@ -117,6 +124,7 @@ def _taken(
     effects: Mapping[Explanation, Signature],
     can: Mapping[Explanation, Sequence[Parameter]],
     gains: Mapping[Explanation, float],
+    allows: Allows,
 ) -> LawsOnDelays | None:
     """Return the fit with the law that gains most, by its linearised effect and its fit; None without one."""
     run, problem, fit = before.run, before.late.problem, before.late.fit
@@ -124,7 +132,7 @@ def _taken(
     more = can[best]
     if len(before.laws) == MOST_LAWS or gains[best] <= EVIDENCE:
         return None
-    if not run.may_try(best.name, wider_cost(problem, True, len(more))):
+    if not allows(best.name, wider_cost(problem, True, len(more))):
         return None
     run.say("fit", f"{best.name} on top of that")
     wide = _fitted(problem, fit, _seen_alone(seen, effects[best], problem, more))

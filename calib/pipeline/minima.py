@@ -202,13 +202,16 @@ def refined_from(
     return from_start(run.problem, (theta, latency_s), stages_s, partial(run.offer, "refinement"))
 
 
-def conclusive(problem: Problem, fit: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
+def conclusive(
+    problem: Problem, fit: Refined, longest: float = CORRELATION_SAMPLES, chance: float | None = None
+) -> bool:
     """Return whether noise explains the residual of a fit, so that no other check is needed.
 
     A residual scale that the user chose proves nothing: then only unseen data can judge. ``longest`` is the
-    longest autocorrelation time of a residual that counts as noise [samples].
+    longest autocorrelation time of a residual that counts as noise [samples]; with a ``chance``, a longer one
+    counts where it may be by that chance.
     """
     from deal_hw.calib.validation.checks import unexplained
 
     chosen = problem.known_std is not None and problem.robot.base is None
-    return not chosen and not unexplained(fit, longest)
+    return not chosen and not unexplained(fit, longest, chance)

@@ -22,6 +22,7 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
+    FALSE_ALARMS,
     MISMATCH_CHI2,
     WHITE_SAMPLES,
     uncertainty_at,
@@ -68,6 +69,7 @@ from deal_hw.findings import Finding
 
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
+    from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
     from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.explain import Explained
     from deal_hw.calib.validation.random_delay import DelayFit
@@ -362,24 +364,28 @@ def conclude_fit(
     restarts: int = 0,
     *,
     wrong: bool = False,
-    late: DelayFit | None = None,
+    late: LawsOnDelays | None = None,
 ) -> FitOutcome:
     """Scan the latency, estimate the uncertainty, and check the result.
 
     ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
     not explain the recordings, although the residual is as large as the weights say. ``late`` is the fit with
-    random delays of commands, where that is known already.
+    random delays of commands, and laws on top, where that is known already.
     """
+    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
     from deal_hw.calib.validation.candidates import Candidate
     from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
     from deal_hw.calib.validation.time_steps import averaged, scan_latency
 
     scan, whole = None, None
-    searched = searched or without_search(run.problem, run.budget, refined if late is None else late.fit)
     if late is None and unexplained(refined, WHITE_SAMPLES):
-        late = run.random_delays(refined)
-    refined = refined if late is None else late.fit
-    problem = run.problem if late is None else late.problem
+        delays = run.random_delays(refined)
+        allows = run.may_try if searched is None else run.allows
+        late = None if delays is None else laws_on_delays(run, delays, allows)
+    before, problem = refined, run.problem
+    if late is not None:
+        run, refined, before, problem = late.run, late.late.fit, late.late.before, late.late.problem
+    searched = searched or without_search(run.problem, run.budget, refined)
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
     doubt = late is not None or wrong or doubtful(refined)
@@ -395,14 +401,14 @@ def conclude_fit(
     if whole is not None:
         known = averaged(problem, whole, known)
     if late is not None:
-        known = late.widened(known, refined.latency_s)
+        known = late.late.widened(known, refined.latency_s)
     with run.check(AFTER_FIT):
         known, checked = judge(problem, refined, known, run.settings, run.tried, run.allows)
     if doubt or unexplained(refined):
         # Delays were found because the fit with a constant one is not right.
-        known = hold_windows(known, refined.latency_s, refined if late is None else late.before)
+        known = hold_windows(known, refined.latency_s, before)
     if late is not None:
-        cause = delay_cause(late, refined.latency_s)
+        cause = delay_cause(late.late, refined.latency_s)
         known = known.with_alarms(cause)
         checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
         taken = Candidate.of("a delay of its own for each command", "likelihood", cause, "taken")
@@ -421,7 +427,7 @@ def conclude_fit(
             "chi2": [p.chi2 for p in scan.refined],
             "weights": scan.weights.tolist(),
         }
-    return FitOutcome(
+    outcome = FitOutcome(
         searched=searched,
         theta=refined.theta,
         latency_s=refined.latency_s,
@@ -431,6 +437,7 @@ def conclude_fit(
         space=problem.space,
         latency_range_s=problem.latency_range_s,
     )
+    return outcome if late is None else late.said(outcome)
 
 
 def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
@@ -526,11 +533,12 @@ def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
     run.say("fit", "does each command act after a delay of its own?")
     if (delays := run.random_delays(run.local)) is None:
         return None
-    found = laws_on_delays(run, delays)
-    late = found.late
-    if not conclusive(late.problem, late.fit) or run.shared_error().found is not None:
+    found = laws_on_delays(run, delays, run.may_try)
+    # What delays leave is asked as the alarm asks: no search makes a residual smaller that is noise.
+    noise_left = conclusive(found.late.problem, found.late.fit, chance=FALSE_ALARMS)
+    if not noise_left or run.shared_error().found is not None:
         return None
-    return found.said(conclude_fit(found.run, None, run.local, late=late))
+    return conclude_fit(run, None, run.local, late=found)
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

@@ -87,13 +87,16 @@ def latency_alarms(
     )
 
 
-def unexplained(refined: Refined, longest: float = CORRELATION_SAMPLES) -> bool:
-    """Return whether the residual exceeds noise, or is autocorrelated over more than ``longest`` samples."""
+def unexplained(refined: Refined, longest: float = CORRELATION_SAMPLES, chance: float | None = None) -> bool:
+    """Return whether the residual exceeds noise, or is autocorrelated over more than ``longest`` samples.
+
+    With a ``chance``, it has to be longer beyond that chance.
+    """
     if refined.chi2 <= NEGLIGIBLE_CHI2:
         return False
     if refined.chi2 > MISMATCH_CHI2:
         return True
-    return correlation_time(refined.normal.residual) > longest
+    return correlation_time(refined.normal.residual, chance) > longest
 
 
 def doubtful(refined: Refined) -> bool:

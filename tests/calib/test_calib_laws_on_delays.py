@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from fakes.fixed_search import FixedSearch
 
 from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.refinement import Refined, at_parameters
-from deal_hw.calib.pipeline import laws_on_delays
+from deal_hw.calib.pipeline import laws_on_delays, stages
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
 from deal_hw.calib.pipeline.methods import usual_budget
+from deal_hw.calib.validation import checks
+from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_windows
 from deal_hw.calib.validation.explain import applicable
 from deal_hw.calib.validation.explanations import sized
+from deal_hw.calib.validation.random_delay import DelayFit, RandomDelay
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import Signature
+from deal_hw.calibration import Budget
+from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 
 FALLING = "friction that falls with speed"
@@ -79,3 +90,69 @@ def test_intervals_hold_shorter_windows_beside_a_law(noisy_problem: Problem, noi
     held = hold_windows(known, fit.latency_s, dataclasses.replace(noisy_refined, refused=refused))
     ratio = np.sqrt(np.diag(held.covariance) / np.diag(known.covariance))
     assert ratio[0] > 2 and ratio[-1] == pytest.approx(1.0)
+
+
+def _run(problem: Problem, settings: Validation) -> CalibrationRun:
+    rng = np.random.default_rng(0)
+    return CalibrationRun(
+        problem=problem,
+        budget=Budget(),
+        rng=rng,
+        attempts=Restarts(FixedSearch(problem.space.nominal, 0.0, 0.05), rng, None),
+        settings=settings,
+        first_steps=problem.steps,
+    )
+
+
+def _late(problem: Problem, fit: Refined) -> DelayFit:
+    return DelayFit(problem, fit, RandomDelay(90.0, 40.0, 0.5, 1e-3), fit)
+
+
+@pytest.mark.parametrize("after_search", [False, True])
+def test_delays_that_a_fit_ends_with_get_laws_too(
+    after_search: bool, noisy_problem: Problem, noisy_refined: Refined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The result has both; after a search, laws may take the steps that checks have left, not a search's."""
+    run = _run(noisy_problem, Validation(split_half=False, physics_step=False, diagnosis=False))
+    late = _late(noisy_problem, noisy_refined)
+    law = Diagnosis.of(
+        "friction", 0.1, 30.0, ("cart",), Finding.alarm("With a law.", "It is one.", "Use it.")
+    )
+    allowed: list[object] = []
+
+    def taken(of: CalibrationRun, fit: DelayFit, allows: Callable[[str, float], bool]) -> LawsOnDelays:
+        allowed.append(allows)
+        return LawsOnDelays(of, fit, {FALLING: law})
+
+    monkeypatch.setattr(laws_on_delays, "laws_on_delays", taken)
+    monkeypatch.setattr(CalibrationRun, "random_delays", lambda *_: late)
+    monkeypatch.setattr(checks, "unexplained", lambda *_: True)
+    searched = stages.without_search(noisy_problem, Budget(), noisy_refined) if after_search else None
+    found = stages.conclude_fit(run, searched, noisy_refined)
+    assert allowed == [run.allows if after_search else run.may_try]
+    names = [one["explanation"] for one in found.facts["candidates"] if one["outcome"] == "taken"]
+    assert names == [LATE, FALLING]
+    assert "With a law. It is one. Use it." in [str(alarm) for alarm in found.known.alarms]
+
+
+@pytest.mark.parametrize(("diagnosis", "far", "asked"), [(True, 25.0, 1), (False, 25.0, 0), (True, 1e-3, 0)])
+def test_no_law_is_asked_for_around_a_poor_fit(
+    diagnosis: bool,
+    far: float,
+    asked: int,
+    noisy_problem: Problem,
+    noisy_refined: Refined,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nor where causes are not asked for."""
+    run, late = _run(noisy_problem, Validation(diagnosis=diagnosis)), _late(noisy_problem, noisy_refined)
+    count: list[object] = []
+
+    def none(*_: object) -> tuple[None, list[object]]:
+        count.append(None)
+        return None, []
+
+    monkeypatch.setattr(laws_on_delays, "FAR", far)
+    monkeypatch.setattr(laws_on_delays, "_with_a_law", none)
+    found = laws_on_delays.laws_on_delays(run, late, run.may_try)
+    assert len(count) == asked and not found.laws and not found.shifts

@@ -70,6 +70,11 @@ def test_a_pattern_as_small_as_noise_asks_for_a_search(small_problem: Callable[.
     assert not conclusive(problem, leaving(pattern), WHITE_SAMPLES)
     # What is far below the noise needs no explanation.
     assert conclusive(problem, leaving(0.5 * pattern), WHITE_SAMPLES)
+    # One window: a memory of 0.5 has time 3, with a standard error of about 1. Eight windows are no chance.
+    longer = scipy.signal.lfilter([np.sqrt(1 - 0.5**2)], [1, -0.5], white[:1], axis=1)
+    assert not conclusive(problem, leaving(longer)) and conclusive(problem, leaving(longer), chance=0.05)
+    all_windows = scipy.signal.lfilter([np.sqrt(1 - 0.5**2)], [1, -0.5], white, axis=1)
+    assert not conclusive(problem, leaving(all_windows), chance=0.05)
 
 
 def test_a_local_fit_is_reported_step_by_step(small_problem: Callable[..., Problem]) -> None:

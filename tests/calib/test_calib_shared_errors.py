@@ -302,14 +302,14 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
     fit = with_rows(at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40))
     late = DelayFit(run.problem, dataclasses.replace(fit, chi2=1.0), RandomDelay(99.0, 99.0, 0.5, 1e-3), fit)
     monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: late)
-    monkeypatch.setattr(stages, "conclusive", lambda problem, fit: fit.chi2 < 1.3)
-    monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda before: (None, []))
-    concluded: list[DelayFit] = []
+    monkeypatch.setattr(stages, "conclusive", lambda problem, fit, chance: fit.chi2 < 1.3)
+    monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda before, allows: (None, []))
+    concluded: list[laws_on_delays.LawsOnDelays] = []
     ended = without_search(run.problem, run.budget, fit)
     known = uncertainty_at(run.problem, fit)
     outcome = FitOutcome(searched=ended, theta=fit.theta, latency_s=fit.latency_s, chi2=1.0, known=known)
 
-    def conclude(*_: object, late: DelayFit) -> FitOutcome:
+    def conclude(*_: object, late: laws_on_delays.LawsOnDelays) -> FitOutcome:
         concluded.append(late)
         return outcome
 
@@ -319,4 +319,4 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
     assert with_random_delays(dataclasses.replace(near, local=dataclasses.replace(fit, chi2=26.0))) is None
     assert concluded == []
     with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(of=5)]))
-    assert concluded == [late]
+    assert [one.late for one in concluded] == [late]
