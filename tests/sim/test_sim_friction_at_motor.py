@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from fakes.sprung_loop import PENDULUM, PLATE, TORQUE, TWO_BODIES, SprungLoop, coupled, transmission_law
 
+from deal_hw.sim.laws.transmission import Couplings, TransmissionLaw
+
 
 def test_dry_friction_of_a_motor_by_hand() -> None:
     """1.5 N·m: it slides from 1 rad/s on; at rest it holds 2 N·m against 3 N·m of the spring."""
@@ -23,6 +25,23 @@ def test_dry_friction_of_a_motor_by_hand() -> None:
     of = transmission_law(play=0.04)
     assert coupled(of, 0.0, 1.0, 0.0, 0.0, 0.0, friction=1.5) == pytest.approx([0.0, 0.0, 0.925, 0.0])
     assert coupled(of, 0.0, 0.0, 0.0, 1.0, 0.0, friction=1.5) == pytest.approx([0.0, 0.0, 0.0, 0.0])
+
+
+def test_a_joint_without_friction_does_not_feel_that_of_another() -> None:
+    """At rest beside one that is held, its motor follows its link as it does alone."""
+    every = {"stiffness": 1e4, "damping": 0.5, "play": 0.0, "inertia": 0.02, "link_inertia": 0.01}
+    of = TransmissionLaw(**{name: np.full((1, 2), value) for name, value in every.items()}, step_s=0.001)
+    rest, friction = np.zeros((4, 1, 2)), np.array([[0.0, 5.0]])
+    found = []
+    for rubs in (None, friction):
+        couplings = Couplings(of, np.zeros((1, 2)), friction=rubs)
+        couplings.couple(rest.copy())
+        moving = np.empty((1, 2))
+        couplings.follow(np.ones((1, 2)), moving)
+        found.append((couplings.inertia[0], moving[0]))
+    (inertia, speed), (rubbing, held) = found
+    assert (rubbing[0], held[0]) == (inertia[0], speed[0]) and speed[0] > 0.1
+    assert held[1] == 0.0 and rubbing[1] > inertia[1]
 
 
 def test_a_held_motor_is_the_fixed_end_of_a_spring_by_hand() -> None:

@@ -237,7 +237,7 @@ class Couplings:
         deflection, motor_speed, link_speed, _ = state
         speeds, torques = self._factors[:, 3]
         speed = self._sums[0] + self._follows * link_speed
-        slides = np.abs(speed) > speeds * friction
+        slides = np.abs(speed) >= speeds * friction
         against = np.copysign(friction, speed)
         spring = self._law.stiffness * deflection + self._damper * motor_speed
         spring -= (self._damper + self._grip) * link_speed
