@@ -149,8 +149,8 @@ def test_writes_everything_a_user_needs(calibrated: Calibrated) -> None:
 def test_a_realistic_robot_is_searched_adversarially(
     realistic: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], search: str | None, words: str
 ) -> None:
-    """Friction, play and jitter that no parameter expresses: after the local fit the search is announced."""
-    asked = {"free": (), "population": 10, "generations": 2, "quiet": False}
+    """A latency that is not the robot's is no cause: after the local fit the search is announced."""
+    asked = {"free": (), "population": 10, "generations": 2, "quiet": False, "latency": 0.0}
     report = calibrate(settings(realistic, **asked, search=search, out=tmp_path))
     reported = " ".join(capsys.readouterr().err.split())
     announced = f"before the search: the local fit leaves more than noise, so {words}"
