@@ -83,14 +83,15 @@ def laws_on_delays(run: CalibrationRun, late: DelayFit, allows: Allows) -> LawsO
     ``allows`` says which fits may be made.
     """
     found = LawsOnDelays(run, dataclasses.replace(late, fit=with_rows(late.fit)))
-    while run.settings.diagnosis and late.fit.chi2 <= FAR:
+    if not run.settings.diagnosis or late.fit.chi2 > FAR:
+        return found
+    while True:
         with run.check(EXPLANATIONS):
             wider, effects = _with_a_law(found, allows)
         if wider is None:
             unsure = tuple(shift for gain, shift in effects if 0 < gain <= EVIDENCE)
             return dataclasses.replace(found, shifts=unsure)
         found = wider
-    return found
 
 
 def _with_a_law(

@@ -117,7 +117,7 @@ class Transmissions:
         self._control, self._torque, self._qacc = outputs("ctrl"), outputs("qfrc_actuator"), outputs("qacc")
         self._gain, self._bias, self._range = (fields.get(name) for name in _FIELDS)
         self._armature = fields.get("dof_armature")
-        self._rubs = [fields.get(name) for name in _RUBS]
+        self._rubs = {name: fields.get(name) for name in _RUBS if self._rubbing.any()}
         self._rubbing_dof = np.array(dof)[self._rubbing]
         # MuJoCo takes the inertia of a body that moves alone ("simple") as it was derived, with the armature.
         self._simple = np.flatnonzero(np.array(model.dof_simplenum)[dof] > 0)
@@ -135,9 +135,10 @@ class Transmissions:
         rotor = self._armature[:, self._dof].copy()
         # Dry friction and damping of the joints that act on the motors, (N, B) each.
         self._friction, self._damping = (
-            np.where(self._rubbing, field[:, self._dof], 0.0) for field in self._rubs
+            np.where(self._rubbing, self._rubs[name][:, self._dof], 0.0) if self._rubs else np.zeros(shape)
+            for name in _RUBS
         )
-        self._constraint = outputs("qfrc_constraint")
+        self._constraint = outputs("qfrc_constraint") if self._rubs else None
         # The inertia at the joint in the model's first pose, with all other joints free.
         whole = 1 / fields.get("dof_invweight0")[:, self._dof]
         self.law = TransmissionLaw(
@@ -203,7 +204,7 @@ class Transmissions:
         for field, own in zip((self._gain, self._bias, self._range), self._nominal, strict=True):
             field[:, at] = own
         self._armature[:, self._dof] = self._model.dof_armature[self._dof]
-        for name, field in zip(_RUBS, self._rubs, strict=True):
+        for name, field in self._rubs.items():
             field[:, self._rubbing_dof] = getattr(self._model, name)[self._rubbing_dof]
 
     def _write_motors(self, rows: npt.NDArray[np.bool_]) -> None:
@@ -225,8 +226,10 @@ class Transmissions:
 
     def _put_friction(self, rows: npt.NDArray[np.bool_]) -> None:
         """Write motors' friction as their joints' in the members of ``rows``, (N, 1), and 0 in the others."""
-        for field, own in zip(self._rubs, (self._friction, self._damping), strict=True):
-            field[:, self._rubbing_dof] = np.where(rows, own[:, self._rubbing], 0.0)
+        if not self._rubs:
+            return
+        for name, own in zip(_RUBS, (self._friction, self._damping), strict=True):
+            self._rubs[name][:, self._rubbing_dof] = np.where(rows, own[:, self._rubbing], 0.0)
 
     def begin(self, forward: Callable[[], None], served: list[int]) -> None:
         """Set the states of fresh rotors: they move with their links, and their springs pass what is needed.
@@ -268,9 +271,10 @@ class Transmissions:
         """Return how far transmissions bend that move rotors and links as one in this state, (N, B)."""
         forward()
         passed = self._torque[:, self._dof] - self.law.inertia * self._qacc[:, self._dof]
-        # What friction takes from the motor does not pass the spring. A constraint beyond it is the link's.
-        passed = passed + within(self._constraint[:, self._dof], self._friction)
-        passed -= self._damping * self._qvel[:, self._dof]
+        if self._constraint is not None:
+            # What friction takes from the motor passes no spring. A constraint beyond it is the link's.
+            passed = passed + within(self._constraint[:, self._dof], self._friction)
+            passed -= self._damping * self._qvel[:, self._dof]
         return self.law.deflection(passed)
 
     def report(self, name: str, values: FloatArray) -> None:

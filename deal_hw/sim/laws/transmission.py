@@ -108,6 +108,14 @@ class TransmissionLaw:
         least = np.maximum(0.5, self.spring_share)
         return np.asarray(np.maximum(least, 1 - 1 / np.maximum(lost, 1.0)))
 
+    def dampers(self, end: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what closed gaps pass for the bodies' speeds from each other at both ends of a step, (N, B).
+
+        Args:
+            end: The share of the speeds at the end, (N, B) [-].
+        """
+        return (1 - end) * self.damping, self.stiffness * self.ahead_s + end * self.damping
+
     def factors(self, resistance: FloatArray, stiffness: FloatArray | float = 0.0) -> FloatArray:
         """Return what a step multiplies by, (12, N, B).
 
@@ -128,8 +136,7 @@ class TransmissionLaw:
         turned = self.step_s**2 * stiffness / self.inertia
         held = stiffness * self.step_s * (1 - 1 / np.maximum(turned, 1.0))
         rotor, kept = carried + end * resistance + held, carried - (1 - end) * resistance
-        spring, damper = self.stiffness, (1 - end) * self.damping
-        grip = spring * self.ahead_s + end * self.damping
+        spring, (damper, grip) = self.stiffness, self.dampers(end)
         both = rotor + grip
         follows, left = grip / both, rotor / both
         # The part of grip that the rotor's speed does not follow.
@@ -173,9 +180,9 @@ class Couplings:
     ) -> None:
         self._law, shape = law, resistance.shape
         self._friction = friction if friction is not None and np.any(friction) else None
-        # Of a spring whose motor stands still.
-        end = law.damper_share(0 * resistance)
-        self._damper, self._grip = (1 - end) * law.damping, law.stiffness * law.ahead_s + end * law.damping
+        if self._friction is not None:
+            # Of a spring whose motor stands still.
+            self._damper, self._grip = law.dampers(law.damper_share(0 * resistance))
         self._gapless = not np.any(law.play)
         self._motors = law.factors(resistance + damping, stiffness), law.factors(0 * resistance + damping)
         self._nowhere: Mask = np.zeros(shape, dtype=bool)
