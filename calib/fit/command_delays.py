@@ -18,9 +18,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -35,6 +36,10 @@ MOST_COMMANDS = 120
 
 DELAY_STD_S = (1e-5, 0.1)
 """Least and largest standard deviation of delays that is looked for [s]."""
+
+UNLIKELY = 2.71
+"""Deviance above the least one at which a larger standard deviation of delays is ruled out [-]: chance goes
+as far in one of twenty cases on that side (chi-square with one degree of freedom; Wilks 1938)."""
 
 
 def with_command_delays(problem: Problem, windows: Sequence[WindowData]) -> list[WindowData]:
@@ -138,13 +143,27 @@ def _in_window(start: IntArray, steps: int, begins: IntArray) -> int:
     return int(np.max(inside, initial=0))
 
 
+class LikelyStd(NamedTuple):
+    """How large the standard deviation of delays is.
+
+    Attributes:
+        std_s: The likeliest one [s].
+        gain: Its gain in deviance over no delays.
+        most_s: The largest one that the residual leaves possible [s]; see `UNLIKELY`.
+    """
+
+    std_s: float
+    gain: float
+    most_s: float
+
+
 def likely_std(
     residuals: Sequence[FloatArray],
     columns: Sequence[FloatArray],
     jacobians: Sequence[FloatArray],
     belief: FloatArray,
-) -> tuple[float, float]:
-    """Return the likeliest standard deviation of delays [s], and its gain in deviance over none.
+) -> LikelyStd:
+    """Return how large the standard deviation of delays is.
 
     It is relative to the size of the sensors' noise, which is estimated, too. The likelihood is the
     restricted one (Patterson and Thompson 1971): a fit follows the delays of its commands, so its residual
@@ -183,7 +202,9 @@ def likely_std(
 
     least, most = np.log(DELAY_STD_S)
     best = minimize_scalar(deviance, bounds=(least, most), method="bounded")
-    return float(np.exp(best.x)), deviance(-np.inf) - float(best.fun)
+    limit = float(best.fun) + UNLIKELY
+    end = brentq(lambda x: deviance(x) - limit, best.x, most) if deviance(most) > limit else most
+    return LikelyStd(float(np.exp(best.x)), deviance(-np.inf) - float(best.fun), float(np.exp(end)))
 
 
 @dataclass(frozen=True, slots=True)

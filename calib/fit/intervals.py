@@ -167,6 +167,11 @@ class Uncertainty:
         """Return it with more alarms, before and after its own."""
         return dataclasses.replace(self, alarms=as_one((*first, *self.alarms, *last)))
 
+    def with_jitter(self, timing_std_s: float, means: str) -> Uncertainty:
+        """Return it with another meaning of its alarm of sample times that jitter, if it has one."""
+        plain, said = jitter_alarm(timing_std_s), jitter_alarm(timing_std_s, means)
+        return dataclasses.replace(self, alarms=tuple(said if a == plain else a for a in self.alarms))
+
     def with_covariance(self, covariance: FloatArray) -> Uncertainty:
         """Return it with another covariance, (K, K), and the intervals that follow from it."""
         return dataclasses.replace(
@@ -390,6 +395,18 @@ def intervals(
     return np.stack([low, high], axis=1)
 
 
+def jitter_alarm(
+    timing_std_s: float,
+    means: str = "The model's delay is constant: if commands jitter too, the intervals are too narrow.",
+) -> Finding:
+    """Return the alarm of sample times that jitter; ``means`` says what the intervals have of it."""
+    return Finding.alarm(
+        f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
+        means,
+        "Record over a connection with less jitter, or with the device's own time stamps.",
+    )
+
+
 def _alarms(
     space: ParameterSpace,
     theta: FloatArray,
@@ -401,13 +418,7 @@ def _alarms(
 ) -> tuple[Finding, ...]:
     alarms: list[Finding] = []
     if timing_std_s >= LEAST_JITTER_S:
-        alarms.append(
-            Finding.alarm(
-                f"The times of the samples jitter by {1e3 * timing_std_s:.1f} ms.",
-                "The model's delay is constant: if commands jitter too, the intervals are too narrow.",
-                "Record over a connection with less jitter, or with the device's own time stamps.",
-            )
-        )
+        alarms.append(jitter_alarm(timing_std_s))
     if chi2 > MISMATCH_CHI2:
         alarms.append(Unexplained.larger(chi2))
     if chi2 > NEGLIGIBLE_CHI2 and least_tau > CORRELATION_SAMPLES:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.refinement import Refined
     from deal_hw.calib.validation.explain import Tried
     from deal_hw.calib.validation.explanations import Explanation
-    from deal_hw.calib.validation.random_delay import DelayFit
+    from deal_hw.calib.validation.random_delay import DelaysAsked
     from deal_hw.calib.validation.shared_errors import SharedErrorCheck
 
 SHARED_ERRORS = "errors that commands and measurements share"
@@ -105,7 +105,7 @@ class CalibrationRun:
     left_out: dict[str, str] = field(default_factory=dict)
     inexact: set[str] = field(default_factory=set)
     shared: list[SharedErrorCheck] = field(default_factory=list)
-    delays: list[tuple[Refined, DelayFit | None]] = field(default_factory=list)
+    delays: list[tuple[Refined, DelaysAsked]] = field(default_factory=list)
     _begun: list[int] = field(default_factory=list)
 
     @contextlib.contextmanager
@@ -167,8 +167,8 @@ class CalibrationRun:
                 self.shared.append(find_shared_error(self.problem, self.local, tell, most))
         return self.shared[0]
 
-    def random_delays(self, fit: Refined) -> DelayFit | None:
-        """Return a fit with random delays of commands, if it shows them; each fit is asked once."""
+    def random_delays(self, fit: Refined) -> DelaysAsked:
+        """Return what a fit says of random delays of commands; each fit is asked once."""
         from deal_hw.calib.validation.random_delay import fit_delays
 
         for before, found in self.delays:

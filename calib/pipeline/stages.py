@@ -23,6 +23,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
     FALSE_ALARMS,
+    LEAST_JITTER_S,
     MISMATCH_CHI2,
     WHITE_SAMPLES,
     uncertainty_at,
@@ -65,14 +66,11 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
-from deal_hw.findings import Finding
 
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
     from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
-    from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.explain import Explained
-    from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -375,21 +373,27 @@ def conclude_fit(
     from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
     from deal_hw.calib.validation.candidates import Candidate
     from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
+    from deal_hw.calib.validation.random_errors import fit_errors
     from deal_hw.calib.validation.time_steps import averaged, scan_latency
 
-    scan, whole = None, None
-    if late is None and unexplained(refined, WHITE_SAMPLES):
-        delays = run.random_delays(refined)
+    scan, whole, asked = None, None, None
+    jitters = run.problem.noise.timing_std_s >= LEAST_JITTER_S
+    if late is None and (jitters or unexplained(refined, WHITE_SAMPLES)):
+        asked = run.random_delays(refined)
         allows = run.may_try if searched is None else run.allows
-        late = None if delays is None else laws_on_delays(run, delays, allows)
-    before, problem = refined, run.problem
+        late = None if asked.found is None else laws_on_delays(run, asked.found, allows)
+    before, problem, errors = refined, run.problem, None
     if late is not None:
         run, refined, before, problem = late.run, late.late.fit, late.late.before, late.late.problem
     searched = searched or without_search(run.problem, run.budget, refined)
+    if late is None and asked is not None and asked.correlated is not None and not wrong:
+        run.say("fit", "the residual is correlated; a fit that allows for random errors")
+        errors = fit_errors(asked.correlated)
+        refined = refined if errors is None else errors.fit
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.
     doubt = late is not None or wrong or doubtful(refined)
-    if problem.fixed_latency_s is None and not doubt:
+    if problem.fixed_latency_s is None and not (doubt or jitters or errors is not None):
         scan = scan_latency(problem, refined, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
         whole = scan if scan.decides(refined) else None
@@ -402,13 +406,18 @@ def conclude_fit(
         known = averaged(problem, whole, known)
     if late is not None:
         known = late.late.widened(known, refined.latency_s)
+    elif errors is not None:
+        known = errors.widened(known, refined.latency_s)
+    elif asked is not None:
+        known = asked.widened(known, refined, decided)
+    plain = before if errors is not None else refined
     with run.check(AFTER_FIT):
-        known, checked = judge(problem, refined, known, run.settings, run.tried, run.allows)
-    if doubt or unexplained(refined):
+        known, checked = judge(problem, refined, known, run.settings, run.tried, run.allows, plain=plain)
+    if doubt or unexplained(plain):
         # Delays were found because the fit with a constant one is not right.
         known = hold_windows(known, refined.latency_s, before)
     if late is not None:
-        cause = delay_cause(late.late, refined.latency_s)
+        cause = late.late.cause(refined.latency_s)
         known = known.with_alarms(cause)
         checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
         taken = Candidate.of("a delay of its own for each command", "likelihood", cause, "taken")
@@ -421,6 +430,8 @@ def conclude_fit(
         "refinement_iterations": refined.iterations,
         **checked,
     }
+    if errors is not None:
+        facts["random_errors"] = errors.errors.shares
     if scan is not None:
         facts["latency_scan"] = {
             "ticks": list(scan.ticks),
@@ -431,29 +442,13 @@ def conclude_fit(
         searched=searched,
         theta=refined.theta,
         latency_s=refined.latency_s,
-        chi2=refined.chi2,
+        chi2=plain.chi2,
         known=known,
         facts=facts,
         space=problem.space,
         latency_range_s=problem.latency_range_s,
     )
     return outcome if late is None else late.said(outcome)
-
-
-def delay_cause(late: DelayFit, latency_s: float) -> Diagnosis:
-    """Return random delays of commands as a cause of the residual, which the fit has allowed for."""
-    from deal_hw.calib.validation.cause_words import Diagnosis
-
-    found = late.found
-    alarm = Finding.alarm(
-        f"Each command acts after its own delay: {1e3 * latency_s:.3g} ms on average, with a standard "
-        f"deviation of {1e3 * found.std_s:.2g} ms.",
-        "The latency is their mean. Each command's own delay was an unknown of the fit, so the intervals "
-        "include them.",
-        "To measure more exactly: end other programs on the computer that sends, send at an even pace, or "
-        "time-stamp commands where they are received.",
-    )
-    return Diagnosis.of("delay", found.share, found.deviance, (), alarm)
 
 
 def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
@@ -531,7 +526,7 @@ def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
     if run.local is None or run.local.chi2 > FAR:
         return None
     run.say("fit", "does each command act after a delay of its own?")
-    if (delays := run.random_delays(run.local)) is None:
+    if (delays := run.random_delays(run.local).found) is None:
         return None
     found = laws_on_delays(run, delays, run.may_try)
     # What delays leave is asked as the alarm asks: no search makes a residual smaller that is noise.

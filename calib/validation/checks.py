@@ -185,6 +185,8 @@ def judge(
     settings: Validation,
     tried: Sequence[Tried] = (),
     allows: Allows = all_allowed,
+    *,
+    plain: Refined | None = None,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
 
@@ -197,7 +199,9 @@ def judge(
         settings: Which checks to run.
         tried: Laws that the model may lack, which were tried.
         allows: Which of the long ones may run.
+        plain: The fit by least squares whose residual is judged, where the fit allows for random errors.
     """
+    plain = plain or refined
     facts: dict[str, Any] = {
         "inflation": known.inflation,
         "at_bound": names_at_bound(problem.space, refined.theta),
@@ -212,15 +216,15 @@ def judge(
         }
     if settings.physics_step:
         known, facts["physics_step"] = with_step(problem, refined, known)
-    asked = settings.diagnosis and unexplained(refined)
-    found = diagnose(problem, refined, tried, allows) if asked else Diagnosed()
+    asked = settings.diagnosis and unexplained(plain)
+    found = diagnose(problem, with_rows(plain), tried, allows) if asked else Diagnosed()
     if settings.split_half:
         split = check_split_half(problem, refined, known, allows)
         known = widened_by_split_half(known, split, refined.latency_s, problem.latency_range_s)
         facts["split_half"] = split.to_json()
     if asked:
         known = with_unsure(problem, refined, known, found.unsure)
-        known, facts["diagnosis"] = with_causes(problem, refined, known, found.causes)
+        known, facts["diagnosis"] = with_causes(problem, plain, known, found.causes)
         facts["candidates"] = [one.to_json() for one in found.candidates]
     return known, facts
 

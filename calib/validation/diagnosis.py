@@ -38,6 +38,7 @@ from deal_hw.calib.validation.explain import (
     try_explanations,
 )
 from deal_hw.calib.validation.random_delay import random_delay
+from deal_hw.calib.validation.random_errors import SeenErrors
 from deal_hw.calib.validation.recording_zeros import MOST_ZERO, named_zeros
 from deal_hw.calib.validation.signatures import Cause, Signature, masses
 from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost
@@ -347,7 +348,7 @@ def _zero_diagnosis(
 
 def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
     """Return whether commands seem to have delays of their own beside other causes; see `.random_delay`."""
-    found = random_delay(known.without(taken), known.answers, known.period_s)
+    found = random_delay(SeenErrors(known.without(taken), known.answers, known.period_s))
     if found is None or not (found.gain > EVIDENCE and found.share > NOTICED):
         return None
     if found.std_s > known.most_delay_std_s:

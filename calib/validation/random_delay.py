@@ -7,51 +7,47 @@ round, over many of them. All are Gaussian processes beside white noise. Random 
 residual is likelier with them than with forces alone, and slow ones are not likelier still by more than
 chance: a robot can have both. Then the fit is repeated with a delay of its own for each command; see
 :mod:`deal_hw.calib.fit.command_delays`.
+
+Where they are not found, the residual may still be far likelier with these processes than as white noise.
+Then the fit allows for them; see :mod:`deal_hw.calib.validation.random_errors`. If white noise is as likely,
+commands may jitter all the same where sample times do: intervals hold what the residual leaves possible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import Bounds, minimize
 
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import CommandDelays, Problem
 from deal_hw.calib.fit.command_delays import (
     MOST_COMMANDS,
+    FreeRows,
+    LikelyStd,
     command_spacing_s,
-    command_times,
     commands_of,
-    delay_columns,
     free_rows,
     likely_std,
     moved_commands,
 )
-from deal_hw.calib.fit.intervals import EVIDENCE, Uncertainty, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, LEAST_JITTER_S, Uncertainty, kinks_of
 from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
-from deal_hw.calib.fit.residual import Shooting, WindowRows
-from deal_hw.calib.validation.signatures import SignatureResponse, answers
+from deal_hw.calib.validation.cause_words import Diagnosis
+from deal_hw.calib.validation.random_errors import (
+    FORCES,
+    LikelyErrors,
+    SeenErrors,
+    at_least,
+    linearised,
+)
+from deal_hw.calibration import Z90
 from deal_hw.errors import InsufficientDataError
+from deal_hw.findings import Finding
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
-
-FEWEST_WINDOWS = 4
-"""Fewest windows."""
-
-MOST_ENTRIES = 2_000_000
-"""Most entries of the windows' covariances; with more, windows are left out, spread over the recordings."""
-
-ROWS = 320
-"""Residuals of each window, from its start."""
-
-SLOW_S = 0.1
-"""Correlation time of the slow force, and of delays that change slowly [s]."""
-
-VARIANCE_RATIO = (1e-5, 1e5)
-"""Least and largest ratio of the mean variances of a process and the noise [-]."""
 
 MOST_SPACED = 2.5
 """Largest standard deviation of delays, in times between commands [-]. Above a third of that time some
@@ -66,6 +62,43 @@ ROUNDS = 3
 
 ITERATIONS = 6
 """Most iterations of each fit."""
+
+
+class PossibleDelays(NamedTuple):
+    """Delays of commands that a residual neither shows nor rules out.
+
+    J are the derivatives of whitened residuals r by the fitted values; J^T r moves a fit.
+
+    Attributes:
+        std_s: Their standard deviation [s].
+        white: Covariance of J^T r with white noise of unit variance, J^T J, (K + 1, K + 1).
+        late: The same with delays of this size as well.
+    """
+
+    std_s: float
+    white: FloatArray
+    late: FloatArray
+
+    @classmethod
+    def of(cls, rows: Sequence[FreeRows], std_s: float) -> PossibleDelays:
+        """Return delays of this standard deviation."""
+        white = np.sum([np.einsum("wdi,wdj->ij", r.parameter, r.parameter) for r in rows], axis=0)
+        along = [np.einsum("wdi,wdp->wpi", r.parameter, r.columns) for r in rows]
+        late = np.sum([np.einsum("wpi,wpj->ij", each, each) for each in along], axis=0)
+        return cls(std_s, white, white + std_s**2 * late)
+
+    def ratio(self, belief: FloatArray) -> FloatArray:
+        """Return the variance of each value over that with white noise, (K + 1,).
+
+        ``belief`` is the prior information on the values, (K + 1,). Where it is infinite, a value is given.
+        """
+        # x = B J^T r with B = (J^T J + prior)^-1: the sandwich of White (1980), its middle from V.
+        K = len(belief)
+        found, free = np.ones(K), np.isfinite(belief)
+        inside, prior = np.ix_(free, free), np.diag(belief[free])
+        B = np.linalg.inv(self.white[inside] + prior)
+        found[free] = np.diag(B @ (self.late[inside] + prior) @ B) / np.diag(B)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,24 +135,76 @@ class DelayFit:
     found: RandomDelay
     before: Refined
 
+    def cause(self, latency_s: float) -> Diagnosis:
+        """Return the delays as a cause of the residual, which the fit has allowed for."""
+        alarm = Finding.alarm(
+            f"Each command acts after its own delay: {1e3 * latency_s:.3g} ms on average, with a standard "
+            f"deviation of {1e3 * self.found.std_s:.2g} ms.",
+            "The latency is their mean. Each command's own delay was an unknown of the fit, so the intervals "
+            "include them.",
+            "To measure more exactly: end other programs on the computer that sends, send at an even pace, "
+            "or time-stamp commands where they are received.",
+        )
+        return Diagnosis.of("delay", self.found.share, self.found.deviance, (), alarm)
+
     def widened(self, known: Uncertainty, latency_s: float) -> Uncertainty:
         """Return an uncertainty that is at least that of the fit with one constant delay.
 
         Delays also take up a part of what else a model lacks, even where they leave nothing but noise. So
         they make no interval narrower. ``latency_s`` is the mean delay.
         """
-        before = with_rows(self.before)
-        wide = uncertainty_at(before.shooting.problem, before)
-        std = np.zeros(len(known.space))
-        std[: len(wide.space)] = np.sqrt(np.diag(wide.covariance))
-        reach_s = wide.latency_reach_s(before.latency_s)
-        return known.widened_to(std).latency_widened_to(
-            reach_s, latency_s, before.shooting.problem.latency_range_s
+        means = "Commands jitter, too: each has a delay of its own in the fit."
+        return at_least(known, self.before, latency_s, means)
+
+
+@dataclass(frozen=True, slots=True)
+class DelaysAsked:
+    """What a fit's residual says of random delays.
+
+    Attributes:
+        found: The fit with random delays; None where the residual does not show any.
+        correlated: Without such a fit: the one whose residual is likelier with random errors of any kind than
+            as white noise, beyond chance; see :func:`~deal_hw.calib.validation.random_errors.fit_errors`.
+        possible: Without such a fit: delays of commands that jitter as the sample times do, or as much as the
+            residual leaves possible. None where sample times do not jitter, or nothing was asked.
+    """
+
+    found: DelayFit | None = None
+    correlated: Refined | None = None
+    possible: PossibleDelays | None = None
+
+    def widened(self, known: Uncertainty, refined: Refined, fixed_latency: bool) -> Uncertainty:
+        """Return the uncertainty of a fit in which possible delays, if there are any, move the values."""
+        if self.possible is None:
+            return known
+        problem = refined.shooting.problem
+        known = known.with_jitter(problem.noise.timing_std_s, self._means(problem.noise.timing_std_s))
+        flat = 12.0 / np.append(problem.space.width, np.ptp(problem.latency_range_s)) ** 2
+        given = np.append((known.bound != 0) | known.blind, fixed_latency)
+        ratio = self.possible.ratio(np.where(given, np.inf, flat + refined.normal.prior))
+        free, std = ~given, np.zeros(len(flat))
+        white = np.linalg.inv((refined.normal.hessian + np.diag(flat))[np.ix_(free, free)])
+        std[free] = kinks_of(problem) * np.sqrt(ratio[free] * np.diag(white))
+        std = np.minimum(std, flat**-0.5)
+        wider = known.widened_to(std[:-1])
+        if fixed_latency:
+            return wider
+        reach_s = max(Z90 * std[-1], known.latency_reach_s(refined.latency_s))
+        return wider.latency_widened_to(reach_s, refined.latency_s, problem.latency_range_s)
+
+    def _means(self, timing_std_s: float) -> str:
+        """Return what the intervals have of commands that jitter, in words."""
+        possible_s = self.possible.std_s if self.possible is not None else 0.0
+        if possible_s >= timing_std_s:
+            return "Commands may jitter as much: the intervals allow for that."
+        return (
+            f"The recordings leave room for commands that jitter by {1e3 * possible_s:.1g} ms: the intervals "
+            "allow for that."
         )
 
 
-def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | None:
-    """Return the fit with random delays of commands; None where its residual does not show any.
+def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
+    """Ask a fit for random delays of commands, and fit them where its residual shows any.
 
     Args:
         problem: The problem, with a constant delay.
@@ -127,31 +212,42 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
         least: Least gain in deviance that shows them [-].
     """
     if problem.command_delays is not None or problem.noise_free or problem.robot.base is not None:
-        return None
+        return DelaysAsked()
     if problem.known_std is not None:
         # A chosen residual scale is no noise beside which delays could be seen.
-        return None
+        return DelaysAsked()
     still: tuple[dict[int, int], ...] = tuple({} for _ in problem.episodes)
     none = CommandDelays(0.0, refined.theta, refined.latency_s, still)
     # A fit that ended early has seen a part of the recordings only.
     part = refined.shooting.problem.with_command_delays(none)
     asked = refined
-    while (seen := _seen(part, asked)) is None:
+    while (seen := SeenErrors.of(part, asked)) is None:
         # Its windows may hold too many commands, and those of the stage before it fewer.
         if asked.shorter is None:
-            return None
+            return DelaysAsked()
         asked = asked.shorter
-    rows, columns = seen
-    times = [command_times(part, d, c.shape[2]) for d, c in zip(asked.shooting.data, columns, strict=True)]
-    period_s = problem.episodes[0].period_s
-    found = random_delay(rows, answers(part, asked), period_s, columns, times)
-    if found is None or not found.gain > least:
-        return None
-    std_s, gain = _likely(part, asked, rows, columns)
+    errors = LikelyErrors.of(seen) if seen.enough else None
+    found = None if errors is None else _random_delay(errors)
+    likely = _likely(part, asked, seen.free)
     most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
-    if not gain > least or std_s > most_s:
-        return None
-    delayed = _with(problem.with_command_delays(none), asked, std_s)
+    if found is not None and min(found.gain, likely.gain) > least and likely.std_s <= most_s:
+        delays = _fitted(problem.with_command_delays(none), asked, found, likely.std_s)
+        if delays is not None:
+            return DelaysAsked(replace(delays, before=refined))
+    correlated = asked if errors is not None and errors.gain > EVIDENCE else None
+    jitter_s = problem.noise.timing_std_s
+    if jitter_s < LEAST_JITTER_S:
+        return DelaysAsked(correlated=correlated)
+    possible = PossibleDelays.of(seen.free, min(jitter_s, likely.most_s))
+    return DelaysAsked(correlated=correlated, possible=possible)
+
+
+def _fitted(problem: Problem, asked: Refined, found: RandomDelay, std_s: float) -> DelayFit | None:
+    """Return the fit with random delays of this standard deviation [s]; None where it cannot be made.
+
+    ``asked`` is the fit of the problem with delays of 0.
+    """
+    delayed = _with(problem, asked, std_s)
     best: Refined | None = None
     fit = asked
     for seconds in STAGES_S:
@@ -164,7 +260,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
                 fit = refine(delayed, fit.theta, fit.latency_s, (seconds,), ITERATIONS, states=states)
             except InsufficientDataError:
                 break
-            if (seen := _seen(delayed, fit)) is None:
+            if (seen := linearised(delayed, fit)) is None:
                 break
             free = [free_rows(r.residual, r.parameter, r.start, c) for r, c in zip(*seen, strict=True)]
             moved, shift, changed = moved_commands(delayed, fit.shooting.data, free, std_s)
@@ -178,7 +274,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelayFit | N
     if best is None or best.shooting.problem.command_delays is None:
         return None
     found = replace(found, std_s=std_s * max(best.chi2, 1.0) ** 0.5)
-    return DelayFit(best.shooting.problem, best, found, refined)
+    return DelayFit(best.shooting.problem, best, found, asked)
 
 
 def most_delay_std_s(problem: Problem) -> float:
@@ -211,210 +307,30 @@ def _with(
     return problem.with_command_delays(CommandDelays(std_s, fit.theta, fit.latency_s, tuple(shift)), episodes)
 
 
-def _seen(problem: Problem, fit: Refined) -> tuple[list[WindowRows], list[FloatArray]] | None:
-    """Return linearised residuals of a fit, whitened for the sensors' noise alone, and delays' columns.
-
-    Columns that the fit has are taken, although they are of the values at which it began: those of the next
-    round are of its own.
-    """
-    plain = problem.with_command_delays(None)
-    shooting = Shooting(plain, fit.shooting.length)
-    known: list[FloatArray] = []
-    for data, fitted in zip(shooting.data, fit.shooting.data, strict=True):
-        columns = fitted.by_delay
-        if columns is None:
-            columns = delay_columns(problem, fit.theta, fit.latency_s, data)
-        if columns is None:
-            return None
-        known.append(columns)
-    return list(shooting.normal(fit.point, keep=True).rows), known
-
-
-def _likely(
-    problem: Problem, fit: Refined, rows: Sequence[WindowRows], columns: Sequence[FloatArray]
-) -> tuple[float, float]:
-    """Return the likeliest standard deviation of the delays [s] at a fit, and its gain in deviance."""
-    free = [free_rows(r.residual, r.parameter, r.start, c) for r, c in zip(rows, columns, strict=True)]
+def _likely(problem: Problem, fit: Refined, rows: Sequence[FreeRows]) -> LikelyStd:
+    """Return how large the standard deviation of the delays is at a fit."""
     width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
     return likely_std(
-        [f.residual for f in free],
-        [f.columns for f in free],
-        [f.parameter for f in free],
+        [r.residual for r in rows],
+        [r.columns for r in rows],
+        [r.parameter for r in rows],
         12.0 / width**2 + fit.normal.prior,
     )
 
 
-def random_delay(
-    rows: Sequence[WindowRows],
-    answers: Sequence[SignatureResponse],
-    period_s: float,
-    columns: Sequence[FloatArray] | None = None,
-    times: Sequence[FloatArray] | None = None,
-) -> RandomDelay | None:
-    """Compare random delays beside other processes with these alone; None where there is nothing to compare.
+def random_delay(seen: SeenErrors) -> RandomDelay | None:
+    """Compare random delays beside other processes with these alone; None without enough windows."""
+    return _random_delay(LikelyErrors.of(seen)) if seen.enough else None
 
-    Residuals and the windows' responses to commands are given per episode, and the columns of
-    :func:`delay_columns` with the times of their commands, (W, P) [s], if they are known. Without them each
-    sample's change of a set-point has a delay.
-    """
-    every = [(e, w) for e, _ in enumerate(answers) for w in range(len(rows[e].residual))]
-    entries = sum(len(r.residual) * min(r.residual.shape[1], ROWS) ** 2 for r in rows)
-    chosen = every[:: max(-(-entries // MOST_ENTRIES), 1)]
-    if len(chosen) < FEWEST_WINDOWS or not any(np.any(a.change) for a in answers):
-        return None
-    late = [None] * len(rows) if columns is None else columns
-    when = [None] * len(rows) if times is None else times
-    windows = [_Window.of(rows[e], answers[e], late[e], when[e], w) for e, w in chosen]
-    change = np.concatenate([a.change.reshape(-1, a.change.shape[2]) for a in answers])
-    rms = np.sqrt(np.mean(change**2, axis=0))
-    residual = np.stack([window.residual for window in windows])
-    followed = np.stack([window.parameter for window in windows])
-    delay, scale = _process(windows, "delay", rms, period_s)
-    slow_delay, *forces = (
-        _process(windows, name, rms, period_s)[0] for name in ("slow delay", "white", "slow")
-    )
-    noise, delays, without = (_fitted(residual, followed, these)[0] for these in ([], [delay], forces))
-    rival = _fitted(residual, followed, [*forces, slow_delay])[0]
-    both, ratios, level = _fitted(residual, followed, [*forces, delay])
+
+def _random_delay(errors: LikelyErrors) -> RandomDelay:
+    """Return how well random delays explain a residual, of which all processes are compared."""
+    noise, delays, without = (errors.with_these(*these) for these in ((), ("delay",), FORCES))
+    both, rival = (errors.with_these(*FORCES, late) for late in ("delay", "slow delay"))
+    intensity = errors.covariances["delay"].intensity
     return RandomDelay(
-        deviance=noise - delays,
-        gain=without - both if both - rival < EVIDENCE else 0.0,
-        share=float(ratios[-1] / (1 + ratios.sum())),
-        std_s=float(np.sqrt(ratios[-1] * level / scale)),
+        deviance=noise.deviance - delays.deviance,
+        gain=without.deviance - both.deviance if both.deviance - rival.deviance < EVIDENCE else 0.0,
+        share=both.shares["delay"],
+        std_s=float(np.sqrt(both.sizes["delay"] * both.level / intensity)),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Window:
-    """The first residuals of a window without their projection on the start state.
-
-    Attributes:
-        residual: In the remaining directions, (D,).
-        parameter: Their derivatives by parameters and latency, (D, K + 1).
-        basis: These directions, (H M, D).
-        response: Whitened response to a set-point, (A, H, M).
-        change: Changes of the set-points, (H, A).
-        late: Changes by the delay of each command, if known, (P, H M) [1/s].
-        time_s: Times of these commands, (P,) [s].
-    """
-
-    residual: FloatArray
-    parameter: FloatArray
-    basis: FloatArray
-    response: FloatArray
-    change: FloatArray
-    late: FloatArray | None
-    time_s: FloatArray | None
-
-    @classmethod
-    def of(
-        cls,
-        rows: WindowRows,
-        answer: SignatureResponse,
-        late: FloatArray | None,
-        time_s: FloatArray | None,
-        w: int,
-    ) -> _Window:
-        R, S, M = rows.residual.shape[1], rows.start.shape[2], answer.response.shape[3]
-        H = min(answer.response.shape[2], max(ROWS // M, 4))
-        # The start state's prior comes last.
-        kept = np.concatenate([np.arange(H * M), np.arange(R - S, R)])
-        basis = np.linalg.qr(rows.start[w][kept], mode="complete")[0][:, S:] if S else np.eye(len(kept))
-        residual = basis.T @ rows.residual[w][kept]
-        known = None if late is None else late[w, : H * M].T
-        parameter = basis.T @ rows.parameter[w][kept]
-        return cls(
-            residual=residual,
-            parameter=parameter,
-            basis=basis[: H * M],
-            response=answer.response[:, w, :H],
-            change=answer.change[w, :H],
-            late=known,
-            time_s=None if time_s is None else time_s[w],
-        )
-
-
-def _process(
-    windows: Sequence[_Window],
-    name: Literal["delay", "slow delay", "white", "slow"],
-    rms: FloatArray,
-    period_s: float,
-) -> tuple[FloatArray, float]:
-    """Return the covariance of late commands, or of forces as large as command changes, (A,) rms.
-
-    It is that of the windows' residuals, (W, D, D), for a mean variance of 1. The mean variance of an
-    intensity of 1 follows.
-    """
-    covariance = []
-    for window in windows:
-        A, H, M = window.response.shape
-        late = name in ("delay", "slow delay")
-        moved: FloatArray
-        time_s: FloatArray
-        if late and window.late is not None and window.time_s is not None:
-            moved, time_s = window.late[None], window.time_s
-        else:
-            later = np.zeros((A, H, H, M))
-            for k in range(H):
-                later[:, k, k:] = window.response[:, : H - k]
-            if late:
-                # A command is late for all actuators.
-                moved = np.asarray(np.einsum("ka,akhm->khm", window.change, later)).reshape(1, H, H * M)
-            else:
-                moved = (rms[:, None, None, None] * later).reshape(A, H, H * M)
-            time_s = np.arange(H, dtype=np.float64) * period_s
-        if name in ("slow", "slow delay"):
-            apart = np.abs(np.subtract.outer(time_s, time_s))
-            root = np.linalg.cholesky(np.exp(-apart / SLOW_S) + 1e-9 * np.eye(len(time_s)))
-            moved = np.asarray(np.einsum("lk,alr->akr", root, moved))
-        columns = moved.reshape(-1, H * M) @ window.basis
-        covariance.append(columns.T @ columns)
-    every = np.stack(covariance)
-    scale = max(float(np.mean(np.einsum("wdd->wd", every))), 1e-300)
-    return every / scale, scale
-
-
-def _fitted(
-    residual: FloatArray, followed: FloatArray, covariances: Sequence[FloatArray]
-) -> tuple[float, FloatArray, float]:
-    """Return the deviance of residuals, (W, D), from the most likely processes beside white noise.
-
-    Their mean variances over that of the noise, and the noise's variance, follow. Parameters have followed
-    the processes, so the likelihood is the restricted one (Patterson and Thompson 1971); ``followed`` holds
-    the derivatives by them, (W, D, P).
-    """
-    W, D = residual.shape
-    unit = np.broadcast_to(np.eye(D), (W, D, D))
-    power = np.einsum("wdp,wdp->p", followed, followed)
-    # Where the windows show nothing of a parameter, it follows nothing.
-    seen = power > 0
-    followed, weak = followed[..., seen] / np.sqrt(power[seen]), 1e-9 * np.eye(int(seen.sum()))
-    count = residual.size - int(seen.sum())
-
-    def likelihood(log_ratios: FloatArray) -> tuple[float, FloatArray, float]:
-        """Return deviance, its gradient, and the noise's variance."""
-        parts = [ratio * c for ratio, c in zip(np.exp(log_ratios), covariances, strict=True)]
-        inverse = np.linalg.inv(sum(parts, unit))
-        across = inverse @ followed
-        information = np.einsum("wdp,wdq->pq", followed, across) + weak
-        shift = np.linalg.solve(information, np.einsum("wdp,wd->p", across, residual))
-        whitened = np.einsum("wij,wj->wi", inverse, residual - followed @ shift)
-        level = max(float(np.sum(residual * whitened)) / count, 1e-300)
-        deviance = count * np.log(level) - float(np.sum(np.linalg.slogdet(inverse)[1]))
-        deviance += float(np.linalg.slogdet(information)[1])
-        slope = []
-        for part in parts:
-            moved = np.einsum("wdp,wde,weq->pq", across, part, across, optimize=True)
-            trace = np.sum(inverse * part) - np.trace(np.linalg.solve(information, moved))
-            slope.append(trace - np.einsum("wi,wij,wj->", whitened, part, whitened, optimize=True) / level)
-        return float(deviance), np.array(slope), level
-
-    def cost(log_ratios: FloatArray) -> tuple[float, FloatArray]:
-        return likelihood(log_ratios)[:2]
-
-    found = np.zeros(len(covariances))
-    if covariances:
-        least, most = np.log(VARIANCE_RATIO)
-        found = minimize(cost, found, jac=True, bounds=Bounds(least, most)).x
-    deviance, _, level = likelihood(found)
-    return deviance, np.exp(found), level

@@ -23,7 +23,7 @@ from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_windows
 from deal_hw.calib.validation.explain import applicable
 from deal_hw.calib.validation.explanations import sized
-from deal_hw.calib.validation.random_delay import DelayFit, RandomDelay
+from deal_hw.calib.validation.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import Signature
 from deal_hw.calibration import Budget
@@ -125,7 +125,7 @@ def test_delays_that_a_fit_ends_with_get_laws_too(
         return LawsOnDelays(of, fit, {FALLING: law})
 
     monkeypatch.setattr(laws_on_delays, "laws_on_delays", taken)
-    monkeypatch.setattr(CalibrationRun, "random_delays", lambda *_: late)
+    monkeypatch.setattr(CalibrationRun, "random_delays", lambda *_: DelaysAsked(late))
     monkeypatch.setattr(checks, "unexplained", lambda *_: True)
     searched = stages.without_search(noisy_problem, Budget(), noisy_refined) if after_search else None
     found = stages.conclude_fit(run, searched, noisy_refined)

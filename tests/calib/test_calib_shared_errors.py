@@ -27,7 +27,7 @@ from deal_hw.calib.pipeline.stages import (
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import unexplained
-from deal_hw.calib.validation.random_delay import DelayFit, RandomDelay
+from deal_hw.calib.validation.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.shared_errors import (
     ChannelChange,
@@ -301,7 +301,7 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
     run, suspicion, _ = suspected
     fit = with_rows(at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40))
     late = DelayFit(run.problem, dataclasses.replace(fit, chi2=1.0), RandomDelay(99.0, 99.0, 0.5, 1e-3), fit)
-    monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: late)
+    monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: DelaysAsked(late))
     monkeypatch.setattr(stages, "conclusive", lambda problem, fit, chance: fit.chi2 < 1.3)
     monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda before, allows: (None, []))
     concluded: list[laws_on_delays.LawsOnDelays] = []
