@@ -386,9 +386,9 @@ def conclude_fit(
     if late is not None:
         run, refined, before, problem = late.run, late.late.fit, late.late.before, late.late.problem
     searched = searched or without_search(run.problem, run.budget, refined)
-    if late is None and asked is not None and asked.correlated is not None and not wrong:
+    if late is None and asked is not None and asked.correlated and not wrong:
         run.say("fit", "the residual is correlated; a fit that allows for random errors")
-        errors = fit_errors(asked.correlated)
+        errors = fit_errors(refined)
         refined = refined if errors is None else errors.fit
     # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
     # tell whether they vary.

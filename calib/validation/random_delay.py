@@ -163,14 +163,14 @@ class DelaysAsked:
 
     Attributes:
         found: The fit with random delays; None where the residual does not show any.
-        correlated: Without such a fit: the one whose residual is likelier with random errors of any kind than
+        correlated: Without such a fit: whether the residual is likelier with random errors of any kind than
             as white noise, beyond chance; see :func:`~deal_hw.calib.validation.random_errors.fit_errors`.
         possible: Without such a fit: delays of commands that jitter as the sample times do, or as much as the
             residual leaves possible. None where sample times do not jitter, or nothing was asked.
     """
 
     found: DelayFit | None = None
-    correlated: Refined | None = None
+    correlated: bool = False
     possible: PossibleDelays | None = None
 
     def widened(self, known: Uncertainty, refined: Refined, fixed_latency: bool) -> Uncertainty:
@@ -228,17 +228,19 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
         asked = asked.shorter
     errors = LikelyErrors.of(seen) if seen.enough else None
     found = None if errors is None else _random_delay(errors)
-    likely = _likely(part, asked, seen.free)
+    free = seen.free
+    likely = _likely(part, asked, free)
     most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
     if found is not None and min(found.gain, likely.gain) > least and likely.std_s <= most_s:
         delays = _fitted(problem.with_command_delays(none), asked, found, likely.std_s)
         if delays is not None:
             return DelaysAsked(replace(delays, before=refined))
-    correlated = asked if errors is not None and errors.gain > EVIDENCE else None
+    # Shorter windows say less of the values, so no fit of them takes the place of one of longer ones.
+    correlated = asked is refined and errors is not None and errors.gain > EVIDENCE
     jitter_s = problem.noise.timing_std_s
     if jitter_s < LEAST_JITTER_S:
         return DelaysAsked(correlated=correlated)
-    possible = PossibleDelays.of(seen.free, min(jitter_s, likely.most_s))
+    possible = PossibleDelays.of(free, min(jitter_s, likely.most_s))
     return DelaysAsked(correlated=correlated, possible=possible)
 
 

@@ -320,7 +320,7 @@ class ErrorFit:
 
         Errors of a model are not as random as processes are. So they make no interval narrower.
         """
-        alarms = [a for a in uncertainty_at_before(self.before).alarms if isinstance(a, Unexplained)]
+        alarms = [a for a in _plain_uncertainty(self.before).alarms if isinstance(a, Unexplained)]
         wider = at_least(
             known,
             self.before,
@@ -330,7 +330,7 @@ class ErrorFit:
         return wider.with_alarms(last=alarms)
 
 
-def uncertainty_at_before(before: Refined) -> Uncertainty:
+def _plain_uncertainty(before: Refined) -> Uncertainty:
     """Return the uncertainty of a fit that another one continues."""
     before = with_rows(before)
     return uncertainty_at(before.shooting.problem, before)
@@ -341,7 +341,7 @@ def at_least(known: Uncertainty, before: Refined, latency_s: float, jitter: str)
 
     The latency is the fit's, and ``jitter`` what intervals have of sample times that jitter, in words.
     """
-    wide = uncertainty_at_before(before)
+    wide = _plain_uncertainty(before)
     problem = before.shooting.problem
     std = np.zeros(len(known.space))
     std[: len(wide.space)] = np.sqrt(np.diag(wide.covariance))
