@@ -32,8 +32,8 @@ from deal_hw.calib.fit.output_error import (
 )
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import conclusive, refined_from
-from deal_hw.calib.pipeline.stages import conclude_fit
 from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome, ranked
 from deal_hw.calib.validation.cross_validation import Choice, fold_masks
 from deal_hw.calib.validation.explain import RIVAL, applicable

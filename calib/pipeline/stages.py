@@ -14,7 +14,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
     FALSE_ALARMS,
-    LEAST_JITTER_S,
     MISMATCH_CHI2,
     WHITE_SAMPLES,
     uncertainty_at,
@@ -37,11 +36,11 @@ from deal_hw.calib.fit.refinement import (
 )
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import (
-    AFTER_FIT,
     EXPLANATIONS,
     CalibrationRun,
     FitOutcome,
 )
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import (
     ONE_SEARCH,
     RESTARTS,
@@ -69,7 +68,6 @@ from deal_hw.calibration import (
 
 if TYPE_CHECKING:
     from deal_hw.calib.fit.channel_weights import WeightedFit
-    from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
     from deal_hw.calib.validation.explain import Explained
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
@@ -355,102 +353,6 @@ def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun
     return dataclasses.replace(run, problem=problem), fit
 
 
-def conclude_fit(
-    run: CalibrationRun,
-    searched: CalibrationResult | None,
-    refined: Refined,
-    restarts: int = 0,
-    *,
-    wrong: bool = False,
-    late: LawsOnDelays | None = None,
-) -> FitOutcome:
-    """Scan the latency, estimate the uncertainty, and check the result.
-
-    ``searched`` is the search's result; None where the fit needed no search. With ``wrong`` the model does
-    not explain the recordings, although the residual is as large as the weights say. ``late`` is the fit with
-    random delays of commands, and laws on top, where that is known already.
-    """
-    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
-    from deal_hw.calib.validation.candidates import Candidate
-    from deal_hw.calib.validation.checks import doubtful, hold_windows, judge, unexplained
-    from deal_hw.calib.validation.random_errors import fit_errors
-    from deal_hw.calib.validation.time_steps import averaged, scan_latency
-
-    scan, whole, asked = None, None, None
-    jitters = run.problem.noise.timing_std_s >= LEAST_JITTER_S
-    if late is None and (jitters or unexplained(refined, WHITE_SAMPLES)):
-        asked = run.random_delays(refined)
-        allows = run.may_try if searched is None else run.allows
-        late = None if asked.found is None else laws_on_delays(run, asked.found, allows)
-    before, problem, errors = refined, run.problem, None
-    if late is not None:
-        run, refined, before, problem = late.run, late.late.fit, late.late.before, late.late.problem
-    searched = searched or without_search(run.problem, run.budget, refined)
-    if late is None and asked is not None and asked.correlated and not wrong:
-        run.say("fit", "the residual is correlated; a fit that allows for random errors")
-        errors = fit_errors(refined)
-        refined = refined if errors is None else errors.fit
-    # The mean of delays that vary is no whole number of ticks, and a fit that noise does not explain cannot
-    # tell whether they vary.
-    doubt = late is not None or wrong or doubtful(refined)
-    if problem.fixed_latency_s is None and not (doubt or jitters or errors is not None):
-        scan = scan_latency(problem, refined, run.progress)
-        # Whole ticks that have not converged decide nothing: the free latency is kept.
-        whole = scan if scan.decides(refined) else None
-    if whole is not None:
-        refined = whole.refined[whole.best]
-    decided = whole is not None or problem.fixed_latency_s is not None
-    refined = with_rows(refined)
-    known = uncertainty_at(problem, refined, fixed_latency=decided)
-    if whole is not None:
-        known = averaged(problem, whole, known)
-    if late is not None:
-        known = late.late.widened(known, refined.latency_s)
-    elif errors is not None:
-        known = errors.widened(known, refined.latency_s)
-    elif asked is not None:
-        known = asked.widened(known, refined, decided)
-    plain = before if errors is not None else refined
-    with run.check(AFTER_FIT):
-        known, checked = judge(problem, refined, known, run.settings, run.tried, run.allows, plain=plain)
-    if doubt or unexplained(plain):
-        # Delays were found because the fit with a constant one is not right.
-        known = hold_windows(known, refined.latency_s, before)
-    if late is not None:
-        cause = late.late.cause(refined.latency_s)
-        known = known.with_alarms(cause)
-        checked["diagnosis"] = [cause.to_json(), *checked.get("diagnosis", [])]
-        taken = Candidate.of("a delay of its own for each command", "likelihood", cause, "taken")
-        checked["candidates"] = [taken.to_json(), *checked.get("candidates", [])]
-    facts: dict[str, Any] = {
-        "restarts": restarts,
-        "window_s": refined.shooting.length * problem.episodes[0].period_s,
-        "noise_std": problem.noise.position_std.tolist(),
-        "timing_std_s": problem.noise.timing_std_s,
-        "refinement_iterations": refined.iterations,
-        **checked,
-    }
-    if errors is not None:
-        facts["random_errors"] = errors.errors.shares
-    if scan is not None:
-        facts["latency_scan"] = {
-            "ticks": list(scan.ticks),
-            "chi2": [p.chi2 for p in scan.refined],
-            "weights": scan.weights.tolist(),
-        }
-    outcome = FitOutcome(
-        searched=searched,
-        theta=refined.theta,
-        latency_s=refined.latency_s,
-        chi2=plain.chi2,
-        known=known,
-        facts=facts,
-        space=problem.space,
-        latency_range_s=problem.latency_range_s,
-    )
-    return outcome if late is None else late.said(outcome)
-
-
 def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
     """Conclude a fit whose sensors are finer than the model; its chi2 is relative to the sensors' noise."""
     names = weighted.problem.channel_names
@@ -578,17 +480,3 @@ def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCa
         words = [", ".join(blind)]
     if words:
         progress(Progress(BEFORE_SEARCH, 1, 1, f"the data do not determine: {'; '.join(words)}"))
-
-
-def without_search(problem: Problem, budget: Budget, local: Refined) -> CalibrationResult:
-    """Return the local fit in place of a search's result."""
-    space = problem.space
-    return CalibrationResult(
-        method="local fit",
-        space=space,
-        estimate=local.theta,
-        interval=np.stack([space.low, space.high], axis=1),
-        latency_s=local.latency_s,
-        trace=({"generation": 0.0, "chi2": local.chi2},),
-        provenance={"budget": dataclasses.asdict(budget)},
-    )

@@ -62,6 +62,13 @@ class Candidate:
             share=cause.share,
         )
 
+    @classmethod
+    def of_errors(cls, gain: float, shares: Iterable[float]) -> Candidate:
+        """Return random errors that a fit allows for, with their gain in deviance and their shares."""
+        share = sum(shares)
+        name = "random forces and late commands"
+        return cls(explanation=name, judged="likelihood", outcome="taken", deviance=gain, share=share)
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
         return dataclasses.asdict(self) | {"values": dict(self.values)}

@@ -29,19 +29,20 @@ from deal_hw.calib.fit.command_delays import (
     LikelyStd,
     command_spacing_s,
     commands_of,
+    delay_columns,
     free_rows,
     likely_std,
     moved_commands,
 )
 from deal_hw.calib.fit.intervals import EVIDENCE, LEAST_JITTER_S, Uncertainty, kinks_of
 from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
+from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.random_errors import (
     FORCES,
     LikelyErrors,
     SeenErrors,
     at_least,
-    linearised,
 )
 from deal_hw.calibration import Z90
 from deal_hw.errors import InsufficientDataError
@@ -218,10 +219,8 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
         return DelaysAsked()
     still: tuple[dict[int, int], ...] = tuple({} for _ in problem.episodes)
     none = CommandDelays(0.0, refined.theta, refined.latency_s, still)
-    # A fit that ended early has seen a part of the recordings only.
-    part = refined.shooting.problem.with_command_delays(none)
     asked = refined
-    while (seen := SeenErrors.of(part, asked)) is None:
+    while (seen := SeenErrors.of(asked)) is None:
         # Its windows may hold too many commands, and those of the stage before it fewer.
         if asked.shorter is None:
             return DelaysAsked()
@@ -229,7 +228,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
     errors = LikelyErrors.of(seen) if seen.enough else None
     found = None if errors is None else _random_delay(errors)
     free = seen.free
-    likely = _likely(part, asked, free)
+    likely = _likely(asked, free)
     most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
     if found is not None and min(found.gain, likely.gain) > least and likely.std_s <= most_s:
         delays = _fitted(problem.with_command_delays(none), asked, found, likely.std_s)
@@ -262,7 +261,7 @@ def _fitted(problem: Problem, asked: Refined, found: RandomDelay, std_s: float) 
                 fit = refine(delayed, fit.theta, fit.latency_s, (seconds,), ITERATIONS, states=states)
             except InsufficientDataError:
                 break
-            if (seen := linearised(delayed, fit)) is None:
+            if (seen := _linearised(delayed, fit)) is None:
                 break
             free = [free_rows(r.residual, r.parameter, r.start, c) for r, c in zip(*seen, strict=True)]
             moved, shift, changed = moved_commands(delayed, fit.shooting.data, free, std_s)
@@ -309,8 +308,28 @@ def _with(
     return problem.with_command_delays(CommandDelays(std_s, fit.theta, fit.latency_s, tuple(shift)), episodes)
 
 
-def _likely(problem: Problem, fit: Refined, rows: Sequence[FreeRows]) -> LikelyStd:
+def _linearised(problem: Problem, fit: Refined) -> tuple[list[WindowRows], list[FloatArray]] | None:
+    """Return linearised residuals of a fit, whitened for the sensors' noise alone, and delays' columns.
+
+    Columns that the fit has are taken, although they are of the values at which it began: those of the next
+    round are of its own.
+    """
+    plain = problem.with_command_delays(None)
+    shooting = Shooting(plain, fit.shooting.length)
+    known: list[FloatArray] = []
+    for data, fitted in zip(shooting.data, fit.shooting.data, strict=True):
+        columns = fitted.by_delay
+        if columns is None:
+            columns = delay_columns(problem, fit.theta, fit.latency_s, data)
+        if columns is None:
+            return None
+        known.append(columns)
+    return list(shooting.normal(fit.point, keep=True).rows), known
+
+
+def _likely(fit: Refined, rows: Sequence[FreeRows]) -> LikelyStd:
     """Return how large the standard deviation of the delays is at a fit."""
+    problem = fit.shooting.problem
     width = np.append(problem.space.width, np.ptp(problem.latency_range_s))
     return likely_std(
         [r.residual for r in rows],

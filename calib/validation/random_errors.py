@@ -22,7 +22,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.command_delays import FreeRows, command_times, delay_columns, free_rows
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine_windows
@@ -88,18 +88,28 @@ class SeenErrors:
     times: Sequence[FloatArray] | None = None
 
     @classmethod
-    def of(cls, problem: Problem, fit: Refined) -> SeenErrors | None:
+    def of(cls, fit: Refined, plain: Shooting | None = None) -> SeenErrors | None:
         """Return those of a fit; None where delays of single commands do not show in its windows.
 
-        The problem is without delays, or with those around which the fit's columns are.
+        ``plain`` are the fit's windows, whitened for the sensors' noise alone; by default the fit's own.
         """
-        if (seen := linearised(problem, fit)) is None:
-            return None
-        rows, columns = seen
-        times = [
-            command_times(problem, d, c.shape[2]) for d, c in zip(fit.shooting.data, columns, strict=True)
-        ]
-        return cls(rows, answers(problem, fit), problem.episodes[0].period_s, columns, times)
+        shooting = plain or fit.shooting
+        problem, columns = shooting.problem, []
+        for data in shooting.data:
+            known = data.by_delay
+            if known is None:
+                known = delay_columns(problem, fit.theta, fit.latency_s, data)
+            if known is None:
+                return None
+            columns.append(known)
+        pairs = zip(shooting.data, columns, strict=True)
+        return cls(
+            list(shooting.normal(fit.point, keep=True).rows),
+            answers(problem, dataclasses.replace(fit, shooting=shooting)),
+            problem.episodes[0].period_s,
+            columns,
+            [command_times(problem, data, column.shape[2]) for data, column in pairs],
+        )
 
     @property
     def free(self) -> list[FreeRows]:
@@ -253,25 +263,6 @@ class RandomErrors:
         return {name: size / total for name, size in self.sizes.items()}
 
 
-def linearised(problem: Problem, fit: Refined) -> tuple[list[WindowRows], list[FloatArray]] | None:
-    """Return linearised residuals of a fit, whitened for the sensors' noise alone, and delays' columns.
-
-    Columns that the fit has are taken, although they are of the values at which it began: those of the next
-    round are of its own.
-    """
-    plain = problem.with_command_delays(None)
-    shooting = Shooting(plain, fit.shooting.length)
-    known: list[FloatArray] = []
-    for data, fitted in zip(shooting.data, fit.shooting.data, strict=True):
-        columns = fitted.by_delay
-        if columns is None:
-            columns = delay_columns(problem, fit.theta, fit.latency_s, data)
-        if columns is None:
-            return None
-        known.append(columns)
-    return list(shooting.normal(fit.point, keep=True).rows), known
-
-
 @dataclass(frozen=True, slots=True)
 class LikelyErrors:
     """The likeliest sizes of all processes in a residual.
@@ -309,25 +300,22 @@ class ErrorFit:
         fit: The fit; its residuals are whitened for the errors.
         before: The fit by least squares.
         errors: The likeliest errors.
+        gain: Their gain in deviance over white noise.
     """
 
     fit: Refined
     before: Refined
     errors: RandomErrors
+    gain: float
 
     def widened(self, known: Uncertainty, latency_s: float) -> Uncertainty:
         """Return the fit's uncertainty, at least that of least squares, with the alarms of its residual.
 
         Errors of a model are not as random as processes are. So they make no interval narrower.
         """
+        means = "Commands may jitter, too, and the residual is correlated: the fit allows for random errors."
         alarms = [a for a in _plain_uncertainty(self.before).alarms if isinstance(a, Unexplained)]
-        wider = at_least(
-            known,
-            self.before,
-            latency_s,
-            "Commands may jitter, too, and the residual is correlated: the fit allows for random errors.",
-        )
-        return wider.with_alarms(last=alarms)
+        return at_least(known, self.before, latency_s, means).with_alarms(last=alarms)
 
 
 def _plain_uncertainty(before: Refined) -> Uncertainty:
@@ -355,18 +343,19 @@ def fit_errors(before: Refined) -> ErrorFit | None:
 
     It is None where there are too many residuals, or where not even such errors explain them.
     """
-    plain, fit, errors = before.shooting, before, None
+    plain, fit, found = before.shooting, before, None
     for _ in range(FITS):
-        seen = SeenErrors.of(plain.problem, dataclasses.replace(fit, shooting=plain))
+        seen = SeenErrors.of(fit, plain)
         if seen is None or (windows := seen.whole()) is None:
             return None
         likely = LikelyErrors.of(seen)
         data = whitened_for(plain.data, windows, likely.found, likely.covariances)
-        fit, errors = refine_windows(plain.on(data), fit.point, FIT_ITERATIONS), likely.found
-    if errors is None or not fit.chi2 <= MISMATCH_CHI2:
+        again = refine_windows(plain.on(data), fit.point, FIT_ITERATIONS)
+        fit = dataclasses.replace(again, iterations=fit.iterations + again.iterations)
+        found = ErrorFit(fit, before, likely.found, likely.gain)
+    if found is None or not fit.chi2 <= MISMATCH_CHI2:
         return None
-    fit = dataclasses.replace(fit, iterations=before.iterations + fit.iterations)
-    return ErrorFit(fit, before, errors)
+    return found
 
 
 def likely_errors(windows: Sequence[ErrorWindow], covariances: dict[Process, Covariance]) -> RandomErrors:

@@ -32,7 +32,7 @@ from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import STAGES_S, Refined, refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
-from deal_hw.calib.pipeline.stages import conclude_fit
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation import random_delay as random_delay_module
 from deal_hw.calib.validation.random_delay import DelaysAsked, RandomDelay, _too_many, fit_delays
@@ -313,6 +313,9 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     assert high - low < 15e-3
     # The fit allows for forces that commands do not explain, so it is off by half as much.
     assert found.facts["random_errors"]["white"] > 0.2
+    (row,) = found.facts["candidates"]
+    assert row["explanation"] == "random forces and late commands" and row["outcome"] == "taken"
+    assert row["deviance"] > EVIDENCE and row["share"] > 0.2
     assert abs(found.latency_s - case.latency_s) < 0.6 * (fit.latency_s - case.latency_s)
     # The residual is still that of least squares.
     assert found.chi2 == fit.chi2

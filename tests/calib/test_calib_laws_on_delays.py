@@ -14,8 +14,9 @@ from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.refinement import Refined, at_parameters
-from deal_hw.calib.pipeline import laws_on_delays, stages
+from deal_hw.calib.pipeline import laws_on_delays
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.conclusion import conclude_fit, without_search
 from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
 from deal_hw.calib.pipeline.methods import usual_budget
 from deal_hw.calib.validation import checks
@@ -127,8 +128,8 @@ def test_delays_that_a_fit_ends_with_get_laws_too(
     monkeypatch.setattr(laws_on_delays, "laws_on_delays", taken)
     monkeypatch.setattr(CalibrationRun, "random_delays", lambda *_: DelaysAsked(late))
     monkeypatch.setattr(checks, "unexplained", lambda *_: True)
-    searched = stages.without_search(noisy_problem, Budget(), noisy_refined) if after_search else None
-    found = stages.conclude_fit(run, searched, noisy_refined)
+    searched = without_search(noisy_problem, Budget(), noisy_refined) if after_search else None
+    found = conclude_fit(run, searched, noisy_refined)
     assert allowed == [run.allows if after_search else run.may_try]
     names = [one["explanation"] for one in found.facts["candidates"] if one["outcome"] == "taken"]
     assert names == [LATE, FALLING]

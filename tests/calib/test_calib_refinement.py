@@ -34,9 +34,10 @@ from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.fit.solver import correlated_samples
 from deal_hw.calib.pipeline import minima, stages
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.methods import make_method, usual_budget
 from deal_hw.calib.pipeline.minima import RestartSettings, conclusive, lower_minimum
-from deal_hw.calib.pipeline.stages import CalibrationPipeline, Refinement, conclude_fit
+from deal_hw.calib.pipeline.stages import CalibrationPipeline, Refinement
 from deal_hw.calib.validation.checks import doubtful, unexplained
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.calib.validation.settings import Validation

@@ -17,12 +17,12 @@ from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.pipeline import laws_on_delays, stages
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
+from deal_hw.calib.pipeline.conclusion import without_search
 from deal_hw.calib.pipeline.stages import (
     Fits,
     Refinement,
     with_random_delays,
     with_shared_error,
-    without_search,
 )
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.validation import shared_errors as shared_errors_module
@@ -257,7 +257,7 @@ class AsGiven(Fits):
         """Return the nominal values; see :meth:`Fits.best`."""
         problem = run.problem
         fit = at_parameters(problem, problem.space.nominal, 0.0, 40)
-        searched = stages.without_search(problem, run.budget, fit)
+        searched = without_search(problem, run.budget, fit)
         return FitOutcome(
             searched=searched,
             theta=fit.theta,
