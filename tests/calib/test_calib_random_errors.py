@@ -8,15 +8,19 @@ import dataclasses
 import numpy as np
 import pytest
 from fakes.knee_evidence import PERIOD_S, SAMPLES, WINDOWS
+from fakes.small_runs import small_run
 
 from deal_hw.calib.data.noise import NoiseModel
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, jitter_alarm, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Shooting, WindowRows
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.validation import random_errors
 from deal_hw.calib.validation.random_delay import DelaysAsked, PossibleDelays, fit_delays
 from deal_hw.calib.validation.random_errors import LikelyErrors, SeenErrors, fit_errors, whitened_for
+from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import SignatureResponse
 from deal_hw.sim.recordings.windows import Windows
 from deal_hw.types import FloatArray
@@ -194,3 +198,26 @@ def test_intervals_hold_commands_that_may_jitter(noisy_problem: Problem, noisy_r
     assert any("Commands may jitter as much: the intervals allow" in alarm.means for alarm in wider.alarms)
     given = asked.widened(known, fit, fixed_latency=True)
     assert given.latency_interval_s == known.latency_interval_s
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_calibration_ends_with_the_fit_that_allows_for_errors(
+    wrong: bool, noisy_problem: Problem, noisy_refined: Refined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Chi2 stays that of least squares. Errors that weights allow for are not allowed for twice."""
+    problem = _with_jitter(noisy_problem, 1.5e-4)
+    settings = Validation(split_half=False, physics_step=False, diagnosis=False)
+    run = small_run(problem, settings=settings)
+    monkeypatch.setattr(CalibrationRun, "random_delays", lambda *_: DelaysAsked(correlated=True))
+    fit = dataclasses.replace(noisy_refined, shooting=Shooting(problem, noisy_refined.shooting.length))
+    found = conclude_fit(run, None, fit, wrong=wrong)
+    assert found.chi2 == fit.chi2
+    taken = [row["explanation"] for row in found.facts.get("candidates", [])]
+    if wrong:
+        assert np.array_equal(found.theta, fit.theta)
+        assert "random_errors" not in found.facts and not taken
+    else:
+        assert not np.array_equal(found.theta, fit.theta)
+        assert set(found.facts["random_errors"]) == {"white", "slow", "slow delay", "delay"}
+        assert taken == ["random forces and late commands"]
+        assert any("the fit allows for random errors" in alarm.means for alarm in found.known.alarms)
