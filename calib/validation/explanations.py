@@ -419,9 +419,13 @@ def one_sided(problem: Problem, parameters: Sequence[Parameter]) -> npt.NDArray[
 
 
 def values_in_words(parameters: Sequence[Parameter], values: Sequence[float]) -> str:
-    """Return found values as in an alarm: "a.play = 0.01 rad and b.play = 0.02 rad"."""
-    pairs = zip(parameters, values, strict=True)
-    return listed([f"{p.name} = {value:.2g} {p.unit}".rstrip(" -") for p, value in pairs])
+    """Return found values as in an alarm: "a.play = 0.01 rad and b.play = 0.02 rad".
+
+    Those that are 0 are left out, if others are not: a fit found nothing there.
+    """
+    pairs = list(zip(parameters, values, strict=True))
+    told = [(p, value) for p, value in pairs if value] or pairs
+    return listed([f"{p.name} = {value:.2g} {p.unit}".rstrip(" -") for p, value in told])
 
 
 def tried_value(p: Parameter) -> float:

@@ -37,7 +37,13 @@ from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation.cross_validation import Choice
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
 from deal_hw.calib.validation.explain import DECISIVE, FAR, applicable, explained, try_explanations
-from deal_hw.calib.validation.explanations import EXPLANATIONS, off_value, one_sided, tried_value
+from deal_hw.calib.validation.explanations import (
+    EXPLANATIONS,
+    off_value,
+    one_sided,
+    tried_value,
+    values_in_words,
+)
 from deal_hw.calib.validation.explanations import PLAY as PLAY_LAW
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
@@ -211,6 +217,14 @@ def test_a_parameter_without_effect_at_an_end_moves_one_way(tmp_path: Path) -> N
     filtered: Any = SimpleNamespace(robot=SimpleNamespace(filters="an MJCF's"))
     lag = Parameter.from_zero("a.lag", "command_lag", ("a",), "s", 0.005, 0.1)
     assert one_sided(problem, [lag]).all() and not one_sided(filtered, [lag]).any()
+
+
+def test_a_value_of_0_is_not_told_beside_others() -> None:
+    """A rotor's inertia that the fit leaves at 0 explains nothing; alone it is told."""
+    cart, pole = (Parameter.around(f"{name}.armature", "dof_armature", (name,), "kg", 1.0) for name in "ab")
+    assert values_in_words([cart, pole], [0.834, 0.0]) == "a.armature = 0.83 kg"
+    assert values_in_words([cart, pole], [0.834, 0.2]) == "a.armature = 0.83 kg, b.armature = 0.2 kg"
+    assert values_in_words([cart], [0.0]) == "a.armature = 0 kg"
 
 
 @pytest.mark.slow
