@@ -37,6 +37,9 @@ from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 
+BURST_KURTOSIS = 8.0
+"""Least kurtosis of a residual that comes in bursts; noise has 3 [-]."""
+
 FIRST_RADIUS = 0.7
 """Radius of the first trust region in the parameters' own scale; 0.7 is about a factor two."""
 

@@ -17,7 +17,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.fit.solver import kurtosis
+from deal_hw.calib.fit.solver import BURST_KURTOSIS, kurtosis
 from deal_hw.calib.validation.candidates import (
     Candidate,
     Diagnosed,
@@ -71,9 +71,6 @@ BURST_PART = 0.05
 
 BURST_SHARE = 0.4
 """Bursts hold at least this share of the squared residual [-]."""
-
-BURST_KURTOSIS = 8.0
-"""Least kurtosis of a residual with bursts; noise has 3 [-]."""
 
 BURST_SIZE = 40.0
 """Least squared residual of a burst over the median [-]."""

@@ -27,6 +27,7 @@ from deal_hw.calib.fit.command_delays import FreeRows, command_times, delay_colu
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
+from deal_hw.calib.fit.solver import BURST_KURTOSIS, kurtosis
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.validation.signatures import SignatureResponse, answers
 from deal_hw.types import FloatArray
@@ -341,8 +342,12 @@ def at_least(known: Uncertainty, before: Refined, latency_s: float, jitter: str)
 def fit_errors(before: Refined) -> ErrorFit | None:
     """Return the fit that allows for the likeliest random errors of a fit by least squares.
 
-    It is None where there are too many residuals, or where not even such errors explain them.
+    It is None where there are too many residuals, where they come in bursts (a contact, commands that are not
+    in the recording), or where not even such errors explain them.
     """
+    if kurtosis(before.normal.residual) >= BURST_KURTOSIS:
+        # Processes are as large at all times.
+        return None
     plain, fit, found = before.shooting, before, None
     for _ in range(FITS):
         seen = SeenErrors.of(fit, plain)

@@ -155,6 +155,15 @@ def test_a_fit_with_too_many_residuals_stays_as_it_is(
     assert fit_errors(noisy_refined) is None
 
 
+def test_a_residual_that_comes_in_bursts_is_no_random_error(noisy_refined: Refined) -> None:
+    """A recording that begins with a command under way: a process would be as large at all times."""
+    first, *others = noisy_refined.normal.residual
+    burst = first.copy()
+    burst[0, :5] += 30.0
+    normal = dataclasses.replace(noisy_refined.normal, residual=(burst, *others))
+    assert fit_errors(dataclasses.replace(noisy_refined, normal=normal)) is None
+
+
 def test_the_ratio_of_variances_by_hand() -> None:
     """A value with information 8, a prior of 2 and a score's variance of 98: (98 + 2) / 10."""
     possible = PossibleDelays(1e-3, np.diag([8.0, 1.0]), np.diag([98.0, 1.0]))
