@@ -28,7 +28,7 @@ from deal_hw.calib.fit.command_delays import (
     moved_commands,
     with_command_delays,
 )
-from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import STAGES_S, Refined, refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
@@ -290,7 +290,7 @@ def test_delays_are_asked_of_windows_that_do_not_hold_too_many_commands(
 def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     """Friction that is 40 % larger at standstill moves the latency by 6 ms; the delays vary by 1.1 ms.
 
-    Whole ticks gave it an interval of 2 ms around the wrong value.
+    Whole ticks gave it an interval of 2 ms around the wrong value, and halves of the data left it alone.
     """
     case = _jittering(3, stribeck_ratio=0.4)
     problem, theta = _problem_of(case, ("cart.frictionloss", "servo.stiffness", "servo.damping"))
@@ -310,15 +310,10 @@ def test_a_wrong_friction_law_leaves_the_mean_delay_in_its_interval() -> None:
     low, high = found.known.latency_interval_s
     assert low <= case.latency_s <= high and "latency_scan" not in found.facts
     json.dumps(found.facts)
-    assert high - low < 15e-3
-    # The fit allows for forces that commands do not explain, so it is off by half as much.
-    assert found.facts["random_errors"]["white"] > 0.2
-    (row,) = found.facts["candidates"]
-    assert row["explanation"] == "random forces and late commands" and row["outcome"] == "taken"
-    assert row["deviance"] > EVIDENCE and row["share"] > 0.2
-    assert abs(found.latency_s - case.latency_s) < 0.6 * (fit.latency_s - case.latency_s)
-    # The residual is still that of least squares.
-    assert found.chi2 == fit.chi2
+    # It is wide, and is reported to be.
+    assert high - low < 20e-3 and found.facts["split_half"]["scale"] > 1.5
+    # A residual above the noise is no random error.
+    assert fit.chi2 > MISMATCH_CHI2 and "random_errors" not in found.facts
 
 
 @pytest.mark.parametrize(("std_s", "tried"), [(0.012, True), (0.021, False)])
