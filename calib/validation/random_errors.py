@@ -97,12 +97,9 @@ class SeenErrors:
         shooting = plain or fit.shooting
         problem, columns = shooting.problem, []
         for data in shooting.data:
-            known = data.by_delay
-            if known is None:
-                known = delay_columns(problem, fit.theta, fit.latency_s, data)
-            if known is None:
+            if (column := delay_columns(problem, fit.theta, fit.latency_s, data)) is None:
                 return None
-            columns.append(known)
+            columns.append(column)
         pairs = zip(shooting.data, columns, strict=True)
         return cls(
             list(shooting.normal(fit.point, keep=True).rows),
