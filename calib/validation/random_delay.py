@@ -46,6 +46,7 @@ from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.random_errors import (
     FORCES,
+    ComparedErrors,
     LikelyErrors,
     SeenErrors,
     at_least,
@@ -232,8 +233,8 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
         if asked.shorter is None:
             return DelaysAsked()
         asked = asked.shorter
-    errors = LikelyErrors.of(seen) if seen.enough else None
-    found = None if errors is None else _random_delay(errors)
+    compared = ComparedErrors.of(seen) if seen.enough else None
+    found = None if compared is None else _random_delay(compared)
     free = seen.free
     likely = _likely(asked, free)
     most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
@@ -245,7 +246,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
     # residual above the noise is an error of the model that is not random: on a real pendulum with a chi2 of
     # 3.6 a fit that took it for random predicted 1.8 times worse.
     small = asked is refined and refined.chi2 <= MISMATCH_CHI2
-    correlated = small and errors is not None and errors.gain > EVIDENCE
+    correlated = small and compared is not None and LikelyErrors.of(compared).gain > EVIDENCE
     jitter_s = problem.noise.timing_std_s
     if jitter_s < LEAST_JITTER_S:
         return DelaysAsked(correlated=correlated)
@@ -351,10 +352,10 @@ def _likely(fit: Refined, rows: Sequence[FreeRows]) -> LikelyStd:
 
 def random_delay(seen: SeenErrors) -> RandomDelay | None:
     """Compare random delays beside other processes with these alone; None without enough windows."""
-    return _random_delay(LikelyErrors.of(seen)) if seen.enough else None
+    return _random_delay(ComparedErrors.of(seen)) if seen.enough else None
 
 
-def _random_delay(errors: LikelyErrors) -> RandomDelay:
+def _random_delay(errors: ComparedErrors) -> RandomDelay:
     """Return how well random delays explain a residual, of which all processes are compared."""
     noise, delays, without = (errors.with_these(*these) for these in ((), ("delay",), FORCES))
     both, rival = (errors.with_these(*FORCES, late) for late in ("delay", "slow delay"))

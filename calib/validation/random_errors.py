@@ -262,32 +262,47 @@ class RandomErrors:
 
 
 @dataclass(frozen=True, slots=True)
+class ComparedErrors:
+    """Windows in which processes are compared.
+
+    Attributes:
+        windows: The windows.
+        covariances: Of each process.
+    """
+
+    windows: Sequence[ErrorWindow]
+    covariances: dict[Process, Covariance]
+
+    @classmethod
+    def of(cls, seen: SeenErrors) -> ComparedErrors:
+        """Return those of a fit's residuals."""
+        windows = seen.compared()
+        return ComparedErrors(windows, {process: Covariance.of(windows, process) for process in PROCESSES})
+
+    def with_these(self, *processes: Process) -> RandomErrors:
+        """Return the likeliest sizes of some of the processes beside white noise."""
+        return likely_errors(self.windows, {process: self.covariances[process] for process in processes})
+
+
+@dataclass(frozen=True, slots=True)
 class LikelyErrors:
     """The likeliest sizes of all processes in a residual.
 
     Attributes:
-        windows: The windows that are compared.
         covariances: Of each process.
         found: The sizes.
         gain: Gain in deviance over white noise.
     """
 
-    windows: Sequence[ErrorWindow]
     covariances: dict[Process, Covariance]
     found: RandomErrors
     gain: float
 
     @classmethod
-    def of(cls, seen: SeenErrors) -> LikelyErrors:
+    def of(cls, compared: ComparedErrors) -> LikelyErrors:
         """Compare all processes beside white noise with white noise."""
-        windows = seen.compared()
-        each = {process: Covariance.of(windows, process) for process in PROCESSES}
-        found = likely_errors(windows, each)
-        return cls(windows, each, found, likely_errors(windows, {}).deviance - found.deviance)
-
-    def with_these(self, *processes: Process) -> RandomErrors:
-        """Return the likeliest sizes of some of the processes beside white noise."""
-        return likely_errors(self.windows, {process: self.covariances[process] for process in processes})
+        found = compared.with_these(*PROCESSES)
+        return cls(compared.covariances, found, compared.with_these().deviance - found.deviance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,7 +365,7 @@ def fit_errors(before: Refined) -> ErrorFit | None:
         seen = SeenErrors.of(fit, plain)
         if seen is None or (windows := seen.whole()) is None:
             return None
-        likely = LikelyErrors.of(seen)
+        likely = LikelyErrors.of(ComparedErrors.of(seen))
         data = whitened_for(plain.data, windows, likely.found, likely.covariances)
         again = refine_windows(plain.on(data), fit.point, FIT_ITERATIONS)
         fit = dataclasses.replace(again, iterations=fit.iterations + again.iterations)

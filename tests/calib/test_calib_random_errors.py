@@ -19,7 +19,13 @@ from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.validation import random_errors
 from deal_hw.calib.validation.random_delay import DelaysAsked, PossibleDelays, fit_delays
-from deal_hw.calib.validation.random_errors import LikelyErrors, SeenErrors, fit_errors, whitened_for
+from deal_hw.calib.validation.random_errors import (
+    ComparedErrors,
+    LikelyErrors,
+    SeenErrors,
+    fit_errors,
+    whitened_for,
+)
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import SignatureResponse
 from deal_hw.sim.recordings.windows import Windows
@@ -84,7 +90,7 @@ def test_a_fit_that_allows_for_slow_forces_is_nearer_and_knows_how_near() -> Non
     plain, off, std = [], [], []
     for seed in range(16):
         seen, by = _pushed(0.1, seed, hertz=4.0)
-        likely = LikelyErrors.of(seen)
+        likely = LikelyErrors.of(ComparedErrors.of(seen))
         assert likely.gain > EVIDENCE
         step, own = _least_variance(seen, likely)
         plain.append(by)
@@ -100,13 +106,13 @@ def test_white_noise_has_no_random_errors() -> None:
     """Nothing is likelier than white noise, beyond chance."""
     for seed in range(5):
         seen, _ = _pushed(0.0, seed)
-        assert LikelyErrors.of(seen).gain < EVIDENCE
+        assert LikelyErrors.of(ComparedErrors.of(seen)).gain < EVIDENCE
 
 
 def test_whitened_windows_leave_unit_covariance() -> None:
     """W V W^T is the unit matrix, with V by the processes' effects and W as a window applies it."""
     seen, _ = _pushed(0.1, 0)
-    likely, windows = LikelyErrors.of(seen), seen.whole()
+    likely, windows = LikelyErrors.of(ComparedErrors.of(seen)), seen.whole()
     assert windows is not None
     data = WindowData(
         episode=0,
