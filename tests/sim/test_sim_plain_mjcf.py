@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import mujoco
@@ -91,6 +92,30 @@ def test_friction_by_speed_in_slow_motion(tmp_path: Path, extra: float) -> None:
         assert bool(made.lacks) != bristles and bool(made.has) == bristles
     constant, bristled = apart
     assert constant > 2.5e-3 and bristled < constant / 10
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mujoco_warp") is None, reason="MuJoCo Warp is not installed (extra gpu)")
+def test_mujoco_warp_has_these_elements(tmp_path: Path) -> None:
+    """Delay, filter and bristles, after a command that has acted for long: the motion is that of MuJoCo."""
+    import mujoco_warp
+
+    kinds = {"command_lag": 0.05, "dof_friction_stribeck": 0.2, "dof_stribeck_speed": 0.3}
+    _, plain, made = both(tmp_path, SERVO, "shoulder", kinds, 0.0095)
+    assert len(made.has) == 3 and made.lacks == ()
+    commands = swing(200, 2)[0]
+    model = mujoco.MjModel.from_xml_path(str(plain))
+    start = mujoco.MjData(model)
+    start.qpos[:] = commands[0]
+    hold(model, start, commands[0])
+    there, data = mujoco_warp.put_model(model), mujoco_warp.put_data(model, start)
+    found = []
+    for now in commands:
+        data.ctrl.assign(now[None].astype(np.float32))
+        mujoco_warp.step(there, data)
+        found.append(data.qpos.numpy()[0].copy())
+    expected = alone(plain, commands, commands[0])
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.ptp(expected))
 
 
 @pytest.mark.parametrize("extra", [0.2, -0.08], ids=["falls", "rises"])
