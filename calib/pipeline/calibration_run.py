@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.intervals import Uncertainty
     from deal_hw.calib.fit.output_error import OutputErrorFit
     from deal_hw.calib.fit.refinement import Refined
+    from deal_hw.calib.validation.candidates import Candidate
+    from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.explain import Tried
     from deal_hw.calib.validation.explanations import Explanation
     from deal_hw.calib.validation.random_delay import DelaysAsked
@@ -69,6 +71,13 @@ class FitOutcome:
         chi2 = self.chi2 if chi2 is None else chi2
         known = self.known.with_alarms(*first, last=last)
         return dataclasses.replace(self, chi2=chi2, known=known, facts={**self.facts, **facts})
+
+    def with_cause(self, cause: Diagnosis, row: Candidate) -> FitOutcome:
+        """Return it with a cause that it has allowed for, before its own, and with its row of the table."""
+        causes, rows = self.facts.get("diagnosis", []), self.facts.get("candidates", [])
+        return self.with_alarms(
+            cause, diagnosis=[cause.to_json(), *causes], candidates=[row.to_json(), *rows]
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

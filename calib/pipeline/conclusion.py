@@ -137,18 +137,16 @@ class _Allowed:
         """Return the result with delays, laws and random errors among its alarms and candidates."""
         from deal_hw.calib.validation.candidates import Candidate
 
-        rows, causes = outcome.facts.get("candidates", []), outcome.facts.get("diagnosis", [])
         if self.errors is not None:
             shares = self.errors.errors.shares
             taken = Candidate.of_errors(self.errors.gain, shares.values())
-            return outcome.with_alarms(random_errors=shares, candidates=[taken.to_json(), *rows])
+            rows = [taken.to_json(), *outcome.facts.get("candidates", [])]
+            return outcome.with_alarms(random_errors=shares, candidates=rows)
         if self.late is None:
             return outcome
         cause = self.late.late.cause(outcome.latency_s)
-        taken = Candidate.of("a delay of its own for each command", "likelihood", cause, "taken")
-        outcome = outcome.with_alarms(
-            cause, diagnosis=[cause.to_json(), *causes], candidates=[taken.to_json(), *rows]
-        )
+        row = Candidate.of("a delay of its own for each command", "likelihood", cause, "taken")
+        outcome = outcome.with_cause(cause, row)
         return self.late.said(outcome)
 
 

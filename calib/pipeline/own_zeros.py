@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import Refined, local_fit
 from deal_hw.calib.pipeline.calibration_run import OWN_ZEROS, CalibrationRun, FitOutcome
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import conclusive
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
@@ -24,40 +25,11 @@ COMMON_ZEROS = "another zero of the encoders"
 """Name of the candidate with one zero for all recordings."""
 
 if TYPE_CHECKING:
-    from deal_hw.calib.validation.cause_words import Diagnosis
     from deal_hw.calib.validation.evidence import Evidence
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class OwnZeros:
-    """A fit with zeros of encoders, those of each recording or one for all.
-
-    Attributes:
-        run: The calibration, with these zeros among its parameters.
-        fit: Its local fit.
-        cause: What they explain.
-        name: What they are.
-    """
-
-    run: CalibrationRun
-    fit: Refined
-    cause: Diagnosis
-    name: str
-
-    def said(self, found: FitOutcome) -> FitOutcome:
-        """Return an outcome of the run with them as its first cause."""
-        from deal_hw.calib.validation.candidates import Candidate
-
-        row = Candidate.of(self.name, "fit", self.cause, "taken").to_json()
-        causes: list[Any] = found.facts.get("diagnosis", [])
-        rows: list[Any] = found.facts.get("candidates", [])
-        return found.with_alarms(
-            self.cause, diagnosis=[self.cause.to_json(), *causes], candidates=[row, *rows]
-        )
-
-
-def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
-    """Return a run with zeros of the encoders, if they leave only noise; otherwise None.
+def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | CalibrationRun:
+    """Ask for other zeros of the encoders, those of each recording or one for all.
 
     Their linearised effect has to predict left-out windows better than a constant force, by half of what is
     no noise. Then a fit with them has to predict the part of the recordings that it has not seen. Where more
@@ -69,6 +41,7 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
         run: The calibration.
         local: Its local fit.
     """
+    from deal_hw.calib.validation.candidates import Candidate
     from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis
     from deal_hw.calib.validation.diagnosis import POOR
     from deal_hw.calib.validation.evidence import evidence
@@ -80,30 +53,30 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
     problem, names = run.problem, recordings_of(e.name for e in run.problem.episodes)
     shared = [] if problem.noise_free else zeros(problem)
     if not (run.settings.laws and shared):
-        return None
+        return run
     with run.check(OWN_ZEROS):
         known = evidence(problem, with_rows(local), answered=False)
         share, joints, differ = _share(known)
         if local.chi2 * share < DECISIVE * (local.chi2 - 1) or local.chi2 * (1 - share) > POOR:
-            return None
+            return run
         units = {p.elements[0]: p.unit for p in shared if p.elements[0] in joints}
         more = own_zeros(units, names) if differ else common_zeros(units)
         if not run.may_try(OWN_ZEROS, wider_cost(problem, True, len(units))):
-            return None
+            return run
         what = "a zero of its own in each recording" if differ else "another zero of the encoders"
         run.say(OWN_ZEROS, f"does {what} predict motion that was not fitted?")
         start = np.append(local.theta, np.zeros(len(more))), local.latency_s
         # Each recording has to show its zero.
         wider = fit_wider(problem, more, seconds=2.0 * len(names) if differ else 0.0, start=start)
         if wider is None or wider.prediction.chi2 > MISMATCH_CHI2:
-            return None
+            return run
         gained = gain_of(wider, local)
         if gained is None or gained.before - wider.prediction.chi2 < DECISIVE * (gained.before - 1):
-            return None
+            return run
     wide = dataclasses.replace(run, problem=problem.with_more(more))
     fit = local_fit(wide.problem, partial(wide.offer, "local fit"), wider.fit)
     if fit is None or not conclusive(wide.problem, fit):
-        return None
+        return run
     values = fit.theta[len(problem.space) :]
     better = f"with chi2 {wider.prediction.chi2:.3g} instead of {gained.before:.3g}: zero"
     if differ:
@@ -127,7 +100,9 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> OwnZeros | None:
             "model's pose, and record again.",
         )
     cause = Diagnosis.of("zero", gained.share, gained.deviance, tuple(units), alarm)
-    return OwnZeros(wide, fit, cause, OWN_ZEROS if differ else COMMON_ZEROS)
+    outcome = conclude_fit(dataclasses.replace(wide, local=fit), None, fit)
+    name = OWN_ZEROS if differ else COMMON_ZEROS
+    return outcome.with_cause(cause, Candidate.of(name, "fit", cause, "taken"))
 
 
 def _share(known: Evidence) -> tuple[float, list[str], bool]:

@@ -14,7 +14,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -22,19 +22,15 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
-    FALSE_ALARMS,
-    MISMATCH_CHI2,
     WHITE_SAMPLES,
     uncertainty_at,
     with_rows,
 )
 from deal_hw.calib.fit.refinement import (
-    LOCAL_HOPELESS,
     Refined,
     local_fit,
-    refine,
 )
-from deal_hw.calib.fit.unexplained import Unexplained
+from deal_hw.calib.pipeline.attempts import MODEL_HOLDS, MODEL_LACKS, attempt, with_explanation, with_weights
 from deal_hw.calib.pipeline.calibration_run import (
     EXPLANATIONS,
     CalibrationRun,
@@ -46,13 +42,10 @@ from deal_hw.calib.pipeline.minima import (
     RESTARTS,
     RestartSettings,
     better,
-    conclusive,
     gains_on_part,
-    lower_minimum,
     refined_from,
     refined_search,
 )
-from deal_hw.calib.pipeline.own_zeros import with_own_zeros
 from deal_hw.calib.pipeline.wider_ranges import grown_ranges, with_doubted_recordings, with_wider_ranges
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import (
@@ -65,10 +58,6 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
-
-if TYPE_CHECKING:
-    from deal_hw.calib.fit.channel_weights import WeightedFit
-    from deal_hw.calib.validation.explain import Explained
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -154,39 +143,21 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         given, narrow = problem, local
         if local is not None:
             run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
-        problem = run.problem
-        from deal_hw.calib.fit.channel_weights import weight_channels
-        from deal_hw.calib.validation.explain import try_explanations
-
-        # Another minimum can leave a residual as small as noise, but with a pattern.
-        white = local is not None and conclusive(problem, local, WHITE_SAMPLES)
-        if local is not None and not white and conclusive(problem, local):
-            local = lower_minimum(run, local, RESTARTS) or local
-            white = conclusive(problem, local)
-        if local is not None and not white and (finer := with_finer_step(run, local)) is not None:
-            run, local = finer
-            white = True
-        zeros = None
-        if local is not None and not white and (zeros := with_own_zeros(run, local)) is not None:
-            run, local = zeros.run, zeros.fit
-            white = True
-        if local is not None and white:
-            found = with_doubted_recordings(run, given, narrow, conclude_fit(run, None, local))
-        elif local is not None and (weighted := weight_channels(problem, local)) is not None:
-            found = conclude_weighted(run, weighted)
+        run = dataclasses.replace(run, local=local)
+        found = attempt(run, MODEL_HOLDS)
+        if isinstance(found, FitOutcome):
+            found = with_doubted_recordings(run, given, narrow, found)
         else:
-            fits = self.fits.started(run)
-            if local is not None and progress is not None:
-                local = with_rows(local)
-                report_unidentifiable(problem, local, progress)
-            run = dataclasses.replace(run, local=local)
-            # Around a poor fit only play and what is 0 are fitted; see `try_explanations`.
-            if local is not None and self.settings.diagnosis:
-                with run.check(EXPLANATIONS):
-                    tried = try_explanations(problem, with_rows(local), run.may_try, say=run.ask)
-                run = dataclasses.replace(run, tried=tried)
-            found = with_explanation(run) or with_random_delays(run) or with_shared_error(fits, run)
-        found = found if zeros is None else zeros.said(found)
+            found = attempt(found, [with_weights])
+        if isinstance(found, CalibrationRun):
+            fits = self.fits.started(found)
+            if found.local is not None and progress is not None:
+                local = with_rows(found.local)
+                report_unidentifiable(found.problem, local, progress)
+                found = dataclasses.replace(found, local=local)
+            found = attempt(found, MODEL_LACKS)
+            if isinstance(found, CalibrationRun):
+                found = with_shared_error(fits, found)
         searched, known = found.searched, found.known
         # The search's own interval does not hold for the refined estimate.
         provenance = {k: v for k, v in searched.provenance.items() if k != "interval"} | {
@@ -197,8 +168,6 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             **found.facts,
             "physics_steps": {"fits": run.fit_steps, **run.checks},
         }
-        if run.problem.robot.step_s < problem.robot.step_s:
-            provenance["fit_step_s"] = run.problem.robot.step_s
         latency_range_s = found.latency_range_s or given.latency_range_s
         if grown := grown_ranges(given, found.space or searched.space, latency_range_s):
             provenance["grown_ranges"] = grown
@@ -320,122 +289,6 @@ def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refin
     if not gains_on_part(run, problem, fit):
         return None
     return refined_from(dataclasses.replace(run, problem=problem), fit.theta, fit.latency_s)
-
-
-def with_finer_step(run: CalibrationRun, local: Refined) -> tuple[CalibrationRun, Refined] | None:
-    """Return the run with a finer physics step, and its fit, if only noise is left then; otherwise None.
-
-    The error of a step is correlated, as that of a wrong model, and fine encoders show it. Where half the
-    step explains a part of the residual, fits with it come before a search.
-    """
-    from deal_hw.calib.validation.time_steps import HALVINGS, check_step, halved
-
-    problem, fit = run.problem, local
-    if problem.noise_free or not local.chi2 < LOCAL_HOPELESS:
-        return None
-    for _ in range(HALVINGS):
-        step = check_step(problem, with_rows(fit))
-        # Residuals grow with the step, so half of it removes three quarters of what it adds to chi2.
-        if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH_CHI2:
-            break
-        problem = halved(problem)
-        window_s = fit.shooting.length * problem.episodes[0].period_s
-        states = fit.shooting.states(fit.point)
-        fit = refine(problem, fit.theta, fit.latency_s, (window_s,), states=states)
-    if problem is run.problem or not conclusive(problem, fit):
-        return None
-    run.offer("local fit", fit)
-    run.say(
-        BEFORE_SEARCH,
-        "the error of the model's physics step shows in these recordings: with "
-        f"{1e3 * problem.robot.step_s:.3g} ms only noise is left, and the fit uses that step",
-    )
-    return dataclasses.replace(run, problem=problem), fit
-
-
-def conclude_weighted(run: CalibrationRun, weighted: WeightedFit) -> FitOutcome:
-    """Conclude a fit whose sensors are finer than the model; its chi2 is relative to the sensors' noise."""
-    names = weighted.problem.channel_names
-    scale = dict(zip(names, map(float, weighted.scale), strict=True))
-    words = ", ".join(f"{name} {value:.2g}" for name, value in scale.items() if value > 1)
-    run.say(
-        BEFORE_SEARCH,
-        "these sensors are finer than the model; the fit weights them by the model's residual "
-        f"(multiples of their noise): {words}",
-    )
-    found = conclude_fit(dataclasses.replace(run, problem=weighted.problem), None, weighted.fit, wrong=True)
-    return found.with_alarms(
-        last=[Unexplained.larger(weighted.chi2)], chi2=weighted.chi2, channel_weights=scale
-    )
-
-
-def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = None) -> FitOutcome | None:
-    """Return the fit with a law that the model lacks, if only noise is left then; otherwise None.
-
-    No search follows: nothing but noise is left to explain. ``searched`` is the result of an earlier one.
-    """
-    from deal_hw.calib.validation.candidates import law_candidates, ranked
-    from deal_hw.calib.validation.checks import hold_alike
-    from deal_hw.calib.validation.explain import explained, rivals
-
-    tried = [one for one in run.tried if run.takes(one.explanation)]
-    if run.local is None or not tried:
-        return None
-    with run.check(EXPLANATIONS):
-        found = explained(run.problem, run.local, tried)
-    if not found or not found[0].explains:
-        return None
-    if searched is None and found[0].diagnosis.code == "mass" and run.shared_error().found is not None:
-        # A clock that runs fast looks like a light link, too, and is the worse fault: that comes first.
-        return None
-    exact: list[tuple[Explained, Refined, CalibrationRun]] = []
-    for one in rivals([one for one in found if one.explains]):
-        name, wide = one.explanation.name, dataclasses.replace(run, problem=one.problem, progress=None)
-        run.say("fit", f"{name} on all recordings")
-        fit = refined_from(wide, one.theta, one.latency_s)
-        if conclusive(one.problem, fit):
-            exact.append((dataclasses.replace(one, theta=fit.theta, latency_s=fit.latency_s), fit, wide))
-        else:
-            run.inexact.add(name)
-    if not exact:
-        return None
-    # The model's own values are somebody's best guess, so of those that explain alike the nearest is taken.
-    (best, fit, wide), *others = sorted(exact, key=lambda each: each[0].change)
-    names = [one.explanation.name for one, *_ in others]
-    alarm = dataclasses.replace(best.diagnosis, do=best.explanation.taken_as(best.added, names))
-    run.say(BEFORE_SEARCH, str(alarm))
-    rows = law_candidates(run.tried, found, best.explanation.name, names)
-    outcome = conclude_fit(wide, searched, fit)
-    if others:
-        shifts = [best.shift_to(one) for one, *_ in others]
-        known, added = hold_alike(best.problem, outcome.known, outcome.latency_s, shifts)
-        outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
-    return outcome.with_alarms(
-        alarm,
-        diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, *_ in others))],
-        candidates=[row.to_json() for row in ranked(rows)],
-    )
-
-
-def with_random_delays(run: CalibrationRun) -> FitOutcome | None:
-    """Return the fit with delays of single commands, and laws, if only noise is left then; otherwise None.
-
-    Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
-    """
-    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
-    from deal_hw.calib.validation.explain import FAR
-
-    if run.local is None or run.local.chi2 > FAR:
-        return None
-    run.say("fit", "does each command act after a delay of its own?")
-    if (delays := run.random_delays(run.local).found) is None:
-        return None
-    found = laws_on_delays(run, delays, run.may_try)
-    # What delays leave is asked as the alarm asks: no search makes a residual smaller that is noise.
-    noise_left = conclusive(found.late.problem, found.late.fit, chance=FALSE_ALARMS)
-    if not noise_left or run.shared_error().found is not None:
-        return None
-    return conclude_fit(run, None, run.local, late=found)
 
 
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:

@@ -122,7 +122,8 @@ def with_doubted_recordings(
     if (suspect := checked.found) is None:
         run.note_untried(checked)
         return found
-    space = run.problem.space
+    # A law or a zero that the fit has is no value of the model.
+    space = found.space or run.problem.space
     values = dict(zip(space.names, map(float, found.theta), strict=True)) | {LATENCY: found.latency_s}
     ranges = {p.name: (p.low, p.high) for p in given.space} | {LATENCY: given.latency_range_s}
     beyond = [f"{name} = {values[name]:.3g} (usual: {_text(given, name, *ranges[name])})" for name in grown]

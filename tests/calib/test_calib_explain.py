@@ -17,6 +17,7 @@ from fakes.small_runs import small_run
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit
+from deal_hw.calib.pipeline.attempts import with_explanation
 from deal_hw.calib.pipeline.conclusion import without_search
 from deal_hw.calib.pipeline.law_choice import (
     LawCandidate,
@@ -29,7 +30,6 @@ from deal_hw.calib.pipeline.output_error_fits import BRIEF, OutputErrorFits
 from deal_hw.calib.pipeline.stages import (
     CalibrationPipeline,
     far_from_noise,
-    with_explanation,
     with_laws_tried,
 )
 from deal_hw.calib.report.verdict import trust

@@ -15,7 +15,7 @@ from fakes.small_runs import small_run
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
-from deal_hw.calib.pipeline.stages import with_explanation
+from deal_hw.calib.pipeline.attempts import with_explanation
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_alike
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose

@@ -13,10 +13,10 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
-from deal_hw.calib.pipeline.stages import with_finer_step
+from deal_hw.calib.fit.unexplained import Unexplained
+from deal_hw.calib.pipeline.attempts import with_finer_step
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.checks import unexplained
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import (
     CLEARLY,
@@ -152,7 +152,8 @@ def test_a_step_that_fine_encoders_show_is_halved_before_a_search(tmp_path: Path
         problem=problem, budget=Budget(), rng=rng, attempts=Restarts(Eki(), rng, None), settings=Validation()
     )
     finer = with_finer_step(run, local)
-    assert finer is not None and finer[0].problem.robot.step_s < 0.002
-    assert finer[1].chi2 == pytest.approx(1.0, abs=0.1) and not unexplained(finer[1])
+    assert isinstance(finer, FitOutcome) and finer.facts["fit_step_s"] < 0.002
+    assert finer.chi2 == pytest.approx(1.0, abs=0.1)
+    assert not [alarm for alarm in finer.known.alarms if isinstance(alarm, Unexplained)]
     # A poor fit has other reasons.
-    assert with_finer_step(run, dataclasses.replace(local, chi2=9.0)) is None
+    assert with_finer_step(run, dataclasses.replace(local, chi2=9.0)) is run

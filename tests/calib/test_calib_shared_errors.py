@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
-from deal_hw.calib.pipeline import laws_on_delays, stages
+from deal_hw.calib.pipeline import attempts, laws_on_delays
+from deal_hw.calib.pipeline.attempts import with_random_delays
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import without_search
 from deal_hw.calib.pipeline.stages import (
     Fits,
     Refinement,
-    with_random_delays,
     with_shared_error,
 )
 from deal_hw.calib.report.verdict import trust
@@ -302,7 +302,7 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
     fit = with_rows(at_parameters(run.problem, run.problem.space.nominal, run.problem.first_latency_s, 40))
     late = DelayFit(run.problem, dataclasses.replace(fit, chi2=1.0), RandomDelay(99.0, 99.0, 0.5, 1e-3), fit)
     monkeypatch.setattr(CalibrationRun, "random_delays", lambda self, of: DelaysAsked(late))
-    monkeypatch.setattr(stages, "conclusive", lambda problem, fit, chance: fit.chi2 < 1.3)
+    monkeypatch.setattr(attempts, "conclusive", lambda problem, fit, chance: fit.chi2 < 1.3)
     monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda before, allows: (None, []))
     concluded: list[laws_on_delays.LawsOnDelays] = []
     ended = without_search(run.problem, run.budget, fit)
@@ -313,10 +313,11 @@ def test_a_wrong_clock_comes_before_delays_that_explain_it(
         concluded.append(late)
         return outcome
 
-    monkeypatch.setattr(stages, "conclude_fit", conclude)
-    near = dataclasses.replace(run, local=dataclasses.replace(fit, chi2=5.0))
-    assert with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(found=suspicion)])) is None
-    assert with_random_delays(dataclasses.replace(near, local=dataclasses.replace(fit, chi2=26.0))) is None
+    monkeypatch.setattr(attempts, "conclude_fit", conclude)
+    near = dataclasses.replace(fit, chi2=5.0)
+    doubted = dataclasses.replace(run, shared=[SharedErrorCheck(found=suspicion)])
+    assert with_random_delays(doubted, near) is doubted
+    assert with_random_delays(doubted, dataclasses.replace(fit, chi2=26.0)) is doubted
     assert concluded == []
-    with_random_delays(dataclasses.replace(near, shared=[SharedErrorCheck(of=5)]))
+    assert with_random_delays(dataclasses.replace(run, shared=[SharedErrorCheck(of=5)]), near) is outcome
     assert [one.late for one in concluded] == [late]
