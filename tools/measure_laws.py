@@ -41,8 +41,10 @@ LAWS: dict[str, dict[str, float]] = {
     "play": SPRING | {"transmission_play": 0.01},
     "encoder-at-motor": SPRING | {"encoder_at_motor": 1.0},
     "friction-at-motor": SPRING | {"friction_at_motor": 1.0},
+    "without-rotors": {"dof_armature": 1e-4},
 }
-"""Parameters of each law: kinds and their values."""
+"""Parameters of each law: kinds and their values. The last is no law, but what a link is in the open gap of a
+gear with play: MuJoCo's own steps of such a robot take longer."""
 EVERY = 10
 """Steps between recorded states, and of a set-point."""
 

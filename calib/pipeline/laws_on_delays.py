@@ -21,8 +21,8 @@ from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.validation.candidates import Candidate
 from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.checks import hold_alike
-from deal_hw.calib.validation.evidence import Evidence, evidence
+from deal_hw.calib.validation.checks import with_unsure
+from deal_hw.calib.validation.evidence import Evidence, evidence, unsure_shift
 from deal_hw.calib.validation.explain import FAR, Allows, applicable, screened, screened_effect, screened_gain
 from deal_hw.calib.validation.explanations import (
     ZERO_CAUSES,
@@ -54,20 +54,19 @@ class LawsOnDelays:
         run: The calibration of the recordings with the laws, without the delays.
         late: The fit, with linearised residuals.
         laws: The laws, as causes, by their names.
-        shifts: Where the values would go, in their scales, and the latency [s], (K + 1,), with each law that
-            gains something, though no more than chance does: it may be there.
+        unsure: Standard deviation of what laws that gain no more than chance may have moved, (K + 1,); see
+            :func:`~deal_hw.calib.validation.evidence.unsure_shift`. Empty for none.
     """
 
     run: CalibrationRun
     late: DelayFit
     laws: Mapping[str, Diagnosis] = field(default_factory=dict)
-    shifts: Sequence[FloatArray] = ()
+    unsure: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def said(self, outcome: FitOutcome) -> FitOutcome:
-        """Return the result of the fit with its laws as alarms, and intervals that hold the shifts."""
-        if self.shifts:
-            known, added = hold_alike(self.late.problem, outcome.known, outcome.latency_s, self.shifts)
-            outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
+        """Return the result of the fit with its laws as alarms, and intervals that hold what may be there."""
+        known = with_unsure(self.late.problem, self.late.fit, outcome.known, self.unsure)
+        outcome = dataclasses.replace(outcome, known=known)
         rows = [Candidate.of(name, "likelihood", law, "taken") for name, law in self.laws.items()]
         return outcome.with_alarms(
             *self.laws.values(),
@@ -89,8 +88,11 @@ def laws_on_delays(run: CalibrationRun, late: DelayFit, allows: Allows) -> LawsO
         with run.check(EXPLANATIONS):
             wider, effects = _with_a_law(found, allows)
         if wider is None:
-            unsure = tuple(shift for gain, shift in effects if 0 < gain <= EVIDENCE)
-            return dataclasses.replace(found, shifts=unsure)
+            # Of a law that seems to gain more, a fit has said that it does not.
+            unsure = [(gain, shift) for gain, shift in effects if gain <= EVIDENCE]
+            if not unsure:
+                return found
+            return dataclasses.replace(found, unsure=unsure_shift(*zip(*unsure, strict=True)))
         found = wider
 
 
@@ -131,7 +133,8 @@ def _taken(
     run, problem, fit = before.run, before.late.problem, before.late.fit
     best = max(gains, key=lambda each: gains[each])
     more = can[best]
-    if len(before.laws) == MOST_LAWS or gains[best] <= EVIDENCE:
+    # The linearised effect is that of a first value: it says which law to fit, not whether it is there.
+    if len(before.laws) == MOST_LAWS or gains[best] <= 0:
         return None
     if not allows(best.name, wider_cost(problem, True, len(more))):
         return None
@@ -140,7 +143,9 @@ def _taken(
     if wide is None:
         return None
     rivals = [e.name for e, gain in gains.items() if e is not best and gains[best] - gain < EVIDENCE < gain]
-    law = _cause(wide, fit, best, rivals)
+    # The fit with the law may have left another minimum, to which one from there without it comes, too.
+    bare = _refined(problem, wide.fit.theta[: len(problem.space)], wide.fit)
+    law = _cause(wide, fit if bare is None else min(fit, bare, key=lambda each: each.chi2), best, rivals)
     if law.deviance <= EVIDENCE:
         return None
     late = dataclasses.replace(before.late, problem=wide.fit.shooting.problem, fit=with_rows(wide.fit))
@@ -151,26 +156,32 @@ def _taken(
 def _seen_alone(
     seen: Evidence, effect: Signature, problem: Problem, more: Sequence[Parameter]
 ) -> list[Parameter]:
-    """Return a law's parameters at the joints that show it, each by its own effect; all where none does."""
+    """Return a law's parameters at the joints that show it, each by its own effect, or at the best of all."""
     one_way, sizes = one_sided(problem, more), sized(more)
-    places: set[str] = set()
+    gains = dict[tuple[str, ...], float]()
     for n, k in enumerate(sizes):
         own = dataclasses.replace(effect, columns=tuple(columns[..., [n]] for columns in effect.columns))
-        if screened_gain(seen, own, one_way[[n]]) > EVIDENCE:
-            places |= set(more[k].elements)
-    return [p for p in more if not places or places & set(p.elements)]
+        gains[more[k].elements] = screened_gain(seen, own, one_way[[n]])
+    least = min(max(gains.values()), EVIDENCE)
+    places = {element for elements, gain in gains.items() if gain >= least for element in elements}
+    return [p for p in more if places & set(p.elements)]
 
 
 def _fitted(problem: Problem, fit: Refined, more: Sequence[Parameter]) -> WiderFit | None:
     """Return the fit with a law's parameters, in the same windows; None where it cannot be fitted."""
     theta = np.append(fit.theta, [tried_value(p) for p in more])
-    window_s = fit.shooting.length * problem.episodes[0].period_s
-    states = fit.shooting.states(fit.point)
+    found = _refined(problem.with_more(more), theta, fit)
+    return None if found is None else WiderFit(problem, more, found, found)
+
+
+def _refined(problem: Problem, theta: FloatArray, begun: Refined) -> Refined | None:
+    """Return a fit from values, (K,), and the latency, windows and start states of another."""
+    window_s = begun.shooting.length * problem.episodes[0].period_s
+    states = begun.shooting.states(begun.point)
     try:
-        found = refine(problem.with_more(more), theta, fit.latency_s, (window_s,), states=states)
+        return refine(problem, theta, begun.latency_s, (window_s,), states=states)
     except (InsufficientDataError, CalibrationError):
         return None
-    return WiderFit(problem, more, found, found)
 
 
 def _cause(wide: WiderFit, fit: Refined, law: Explanation, rivals: Sequence[str]) -> Diagnosis:

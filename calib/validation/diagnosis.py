@@ -26,7 +26,7 @@ from deal_hw.calib.validation.candidates import (
     ranked,
 )
 from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, advice, stretch_words
-from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
+from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of, unsure_shift
 from deal_hw.calib.validation.explain import (
     DECISIVE,
     Allows,
@@ -118,7 +118,7 @@ def diagnose(
         again = {one.explanation.name for one in tried}
         rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
         if refined.chi2 <= POOR:
-            unsure = unsure_shift(known(), {one.code for one in found})
+            unsure = unnamed_shift(known(), {one.code for one in found})
     rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
     return Diagnosed(tuple(found), ranked(rows), unsure)
 
@@ -182,14 +182,10 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     return sorted(found, key=lambda f: -f.deviance)
 
 
-def unsure_shift(known: Evidence, named: Collection[str]) -> FloatArray:
-    """Return how far causes that are not named may have moved the estimates, (P,), as a standard deviation.
+def unnamed_shift(known: Evidence, named: Collection[str]) -> FloatArray:
+    """Return how far causes of the signatures that are not named may have moved the estimates, (P,).
 
-    What is no better than chance to be named may still be there. Each cause alone, and none, weighs as much
-    as it makes the left-out motion likely (pseudo-BMA: Yao, Vehtari, Simpson and Gelman 2018), w_i
-    proportional to exp(D_i / 2) with the gain in deviance D_i, 0 for none. The estimates keep their place, so
-    the mean square of their shifts s_i, sum_i w_i s_i^2, adds to their variance. What is the parameters' own
-    effect is no other cause.
+    What is the parameters' own effect is no other cause. See :func:`unsure_shift`.
     """
     groups = [
         [other for s in group if (other := known.distinct(s)) is not None]
@@ -197,11 +193,12 @@ def unsure_shift(known: Evidence, named: Collection[str]) -> FloatArray:
         if group[0].cause not in named
     ]
     groups = [some for group in groups if group and (some := _possible(known, [], group))]
-    gains = np.array([0.0, *(known.gain([], group) for group in groups)])
-    weights = np.exp((gains - gains.max()) / 2)
+    if not groups:
+        return np.zeros(len(known.prior))
     before = known.coefficients([])
-    shifts = [np.zeros(len(known.prior)), *(_shift(known, before, group) for group in groups)]
-    return np.asarray(np.sqrt(weights / weights.sum() @ np.square(shifts)))
+    return unsure_shift(
+        [known.gain([], group) for group in groups], [_shift(known, before, group) for group in groups]
+    )
 
 
 def _shift(known: Evidence, before: FloatArray, taken: Sequence[Signature]) -> FloatArray:

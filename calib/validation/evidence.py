@@ -260,6 +260,23 @@ def parameter_prior(problem: Problem) -> FloatArray:
     return np.asarray(1 / width**2)
 
 
+def unsure_shift(gains: Sequence[float], shifts: Sequence[FloatArray]) -> FloatArray:
+    """Return how far causes that are not named may have moved the estimates, (P,), as a standard deviation.
+
+    What is no better than chance to be named may still be there. Each cause alone, and none, weighs as much
+    as it makes the left-out motion likely (pseudo-BMA: Yao, Vehtari, Simpson and Gelman 2018), w_i
+    proportional to exp(D_i / 2) with the gain in deviance D_i, 0 for none. The estimates keep their place, so
+    the mean square of their shifts s_i, sum_i w_i s_i^2, adds to their variance.
+
+    Args:
+        gains: D_i of each cause [-].
+        shifts: s_i of each, (P,): of the parameters in their own scales, and of the latency [s].
+    """
+    every = np.array([0.0, *gains])
+    weights = np.exp((every - every.max()) / 2)
+    return np.asarray(np.sqrt((weights / weights.sum())[1:] @ np.square(shifts)))
+
+
 def groups_of(found: Sequence[Signature]) -> list[list[Signature]]:
     """Return the units of the selection: a cause at all joints, or the mass of one body."""
     causes = dict.fromkeys(s.cause for s in found if s.cause != "mass")

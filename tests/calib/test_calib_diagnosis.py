@@ -22,8 +22,8 @@ from deal_hw.calib.validation import diagnosis
 from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes, with_unsure
 from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, unsure_shift, weighs
-from deal_hw.calib.validation.evidence import Evidence, evidence
+from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, unnamed_shift, weighs
+from deal_hw.calib.validation.evidence import Evidence, evidence, unsure_shift
 from deal_hw.calib.validation.explain import explained, try_explanations
 from deal_hw.calib.validation.residual_place import (
     Kind,
@@ -108,6 +108,12 @@ def test_a_parameter_that_other_windows_hardly_show_makes_no_cause() -> None:
     assert name_causes(known) == []
 
 
+def test_each_cause_weighs_what_it_makes_likely() -> None:
+    """Gains of 2 ln 3 and 0 beside none: weights of 3/5 and 1/5, and 1/5 for no shift."""
+    found = unsure_shift([2 * np.log(3.0), 0.0], [np.array([2.0, 0.0]), np.array([1.0, 5.0])])
+    np.testing.assert_allclose(found, [np.sqrt(0.6 * 4 + 0.2), np.sqrt(0.2 * 25)])
+
+
 def test_causes_that_may_be_there_move_a_parameter() -> None:
     """A load beside a parameter that pushes 1 + v: with a load it is 0, and with damping of its other part.
 
@@ -121,10 +127,10 @@ def test_causes_that_may_be_there_move_a_parameter() -> None:
 
     known = knee_evidence(0.02 * load, (push,))
     alone = float(seen(known, 0.02 * load) @ seen(known, push) / np.sum(seen(known, push) ** 2))
-    assert unsure_shift(known, ())[0] == pytest.approx(alone / np.sqrt(2), rel=0.1)
-    assert unsure_shift(known, {"load", "damping"})[0] < 0.1 * alone
+    assert unnamed_shift(known, ())[0] == pytest.approx(alone / np.sqrt(2), rel=0.1)
+    assert unnamed_shift(known, {"load", "damping"})[0] < 0.1 * alone
     little = knee_evidence(0.004 * load, (push,))
-    assert name_causes(little) == [] and unsure_shift(little, ())[0] > 0.2 * alone / 5
+    assert name_causes(little) == [] and unnamed_shift(little, ())[0] > 0.2 * alone / 5
 
 
 def test_a_parameters_own_effect_is_no_other_cause() -> None:

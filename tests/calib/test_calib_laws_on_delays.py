@@ -13,9 +13,10 @@ from deal_hw.bench.loop import calibration_row
 from deal_hw.bench.tasks import make_case
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
+from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, at_parameters
 from deal_hw.calib.pipeline import laws_on_delays
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit, without_search
 from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
 from deal_hw.calib.pipeline.methods import usual_budget
@@ -23,10 +24,11 @@ from deal_hw.calib.validation import checks
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_windows
 from deal_hw.calib.validation.explain import applicable
-from deal_hw.calib.validation.explanations import sized
+from deal_hw.calib.validation.explanations import sized, tried_value
 from deal_hw.calib.validation.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.signatures import Signature
+from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Budget
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
@@ -59,7 +61,7 @@ def _law(problem: Problem) -> list[Parameter]:
 
 
 def test_only_joints_that_show_a_law_get_it(noisy_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each with what shapes it; all where only their sum is seen."""
+    """Each with what shapes it; the first of all where none is seen beyond chance."""
     more = _law(noisy_problem)
     assert len(sized(more)) == 2 and len(more) == 4
     effect = Signature("friction", FALLING, (np.arange(2.0) * np.ones((3, 4, 1)),))
@@ -71,14 +73,70 @@ def test_only_joints_that_show_a_law_get_it(noisy_problem: Problem, monkeypatch:
     found = laws_on_delays._seen_alone(seen, effect, noisy_problem, more)  # type: ignore[arg-type]
     first = more[sized(more)[0]].elements
     assert [p.elements for p in found] == [first, first] and len({p.kind for p in found}) == 2
-    alone[0.0] = 5.0
+    alone[0.0] = 4.0
+    found = laws_on_delays._seen_alone(seen, effect, noisy_problem, more)  # type: ignore[arg-type]
+    assert {p.elements for p in found} == {more[sized(more)[1]].elements}
+    alone |= {0.0: 25.0, 1.0: 35.0}
     assert laws_on_delays._seen_alone(seen, effect, noisy_problem, more) == more  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("gain", "after", "bare", "laws"),
+    [
+        (-1.0, 0.9, 1.0, []),
+        (1.0, 0.9, 1.0, [FALLING]),
+        (25.0, 0.999, 1.0, []),
+        (1.0, 0.9, 0.9, []),
+    ],
+)
+def test_a_fit_decides_whether_a_law_is_there(
+    gain: float,
+    after: float,
+    bare: float,
+    laws: list[str],
+    noisy_problem: Problem,
+    noisy_refined: Refined,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its linearised effect only says which law to fit, and a fit without it may find the same minimum."""
+    law = next(each for each in applicable(noisy_problem) if each.name == FALLING)
+    more, shift = _law(noisy_problem), np.full(len(noisy_refined.theta) + 1, 0.1)
+    wide = noisy_problem.with_more(more)
+    theta = np.append(noisy_refined.theta, [tried_value(p) for p in more])
+    fit = at_parameters(wide, theta, noisy_refined.latency_s, noisy_refined.shooting.length)
+    fit = dataclasses.replace(fit, chi2=after * noisy_refined.chi2)
+    monkeypatch.setattr(laws_on_delays, "applicable", lambda of: {law: more} if of is noisy_problem else {})
+    monkeypatch.setattr(laws_on_delays, "screened_effect", lambda *_: (gain, shift))
+    monkeypatch.setattr(laws_on_delays, "_seen_alone", lambda *_: more)
+    monkeypatch.setattr(laws_on_delays, "_fitted", lambda *_: WiderFit(noisy_problem, more, fit, fit))
+    lower = dataclasses.replace(noisy_refined, chi2=bare * noisy_refined.chi2)
+    monkeypatch.setattr(laws_on_delays, "_refined", lambda *_: lower)
+    run = _run(noisy_problem, Validation(thorough=True))
+    found = laws_on_delays.laws_on_delays(run, _late(noisy_problem, noisy_refined), run.may_try)
+    assert list(found.laws) == laws
+    # A weight of exp(gain / 2) beside 1 for no law; one beyond chance that a fit has refused weighs nothing.
+    weight = np.exp(gain / 2) / (1 + np.exp(gain / 2))
+    expected = np.zeros(0) if laws or gain > 20 else np.sqrt(weight) * shift
+    np.testing.assert_allclose(found.unsure, expected)
+
+
+def test_laws_that_may_be_there_widen_intervals(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """A shift by one standard deviation makes a value's interval wider by the root of two."""
+    fit = with_rows(noisy_refined)
+    known = uncertainty_at(noisy_problem, fit)
+    std = np.sqrt(np.diag(known.covariance))
+    late = _late(noisy_problem, fit)
+    found = LawsOnDelays(_run(noisy_problem, Validation()), late, unsure=np.append(std, 0.0))
+    searched = without_search(noisy_problem, Budget(), fit)
+    outcome = FitOutcome(searched=searched, theta=fit.theta, latency_s=fit.latency_s, chi2=1.0, known=known)
+    wider = found.said(outcome).known
+    ratio = np.sqrt(np.diag(wider.covariance)) / std
+    np.testing.assert_allclose(ratio[~known.blind], np.sqrt(2.0))
+    assert wider.latency_interval_s == known.latency_interval_s
 
 
 def test_intervals_hold_shorter_windows_beside_a_law(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """Fits without the law say nothing of its parameters, and widen the others."""
-    from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
-
     more = _law(noisy_problem)[:1]
     wide = noisy_problem.with_more(more)
     theta = np.append(noisy_refined.theta, more[0].nominal)
@@ -156,4 +214,4 @@ def test_no_law_is_asked_for_around_a_poor_fit(
     monkeypatch.setattr(laws_on_delays, "FAR", far)
     monkeypatch.setattr(laws_on_delays, "_with_a_law", none)
     found = laws_on_delays.laws_on_delays(run, late, run.may_try)
-    assert len(count) == asked and not found.laws and not found.shifts
+    assert len(count) == asked and not found.laws and not len(found.unsure)
