@@ -14,7 +14,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -58,6 +58,10 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
+
+if TYPE_CHECKING:
+    from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
+    from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -243,13 +247,40 @@ class Refinement(Fits):
             # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
                 refined = local
+        before = run
         run, refined = with_wider_ranges(run, refined, partial(_refined_again, run))
+        if (late := delays_before_search(before, run, refined)) is not None:
+            return conclude_fit(before, searched, late.late.before, attempt, late=late)
         if self.predictions is not None and far_from_noise(run, refined):
             run.say("fit", "no values explain the recordings, so fits of predictions follow, and the best")
             return self.predictions.continued(run, searched, refined)
         again = with_laws_tried(run, refined)
         found = None if again is run else with_explanation(again, searched)
         return found or conclude_fit(again, searched, refined, attempt)
+
+
+def delays_before_search(run: CalibrationRun, after: CalibrationRun, refined: Refined) -> LawsOnDelays | None:
+    """Return the local fit with random delays, and laws, where it explains what the search's fit does not.
+
+    That fit may show delays, too. Far from the noise they would explain what no parameters there do.
+
+    Args:
+        run: The calibration at its local fit.
+        after: The same with the ranges of the search's fit.
+        refined: The search's fit.
+    """
+    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
+    from deal_hw.calib.validation.explain import FAR
+
+    def delays(of: CalibrationRun, fit: Refined | None) -> DelayFit | None:
+        return None if fit is None or fit.chi2 > FAR else of.random_delays(fit).found
+
+    if not run.settings.diagnosis or refined.chi2 < RESTARTS.explained:
+        return None
+    late, other = delays(run, run.local), delays(after, refined)
+    if late is None or min(refined.chi2, np.inf if other is None else other.fit.chi2) <= late.fit.chi2:
+        return None
+    return laws_on_delays(run, late, run.allows)
 
 
 def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:

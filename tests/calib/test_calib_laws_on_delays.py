@@ -20,6 +20,7 @@ from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit, without_search
 from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
 from deal_hw.calib.pipeline.methods import usual_budget
+from deal_hw.calib.pipeline.stages import delays_before_search
 from deal_hw.calib.validation import checks
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_windows
@@ -215,3 +216,46 @@ def test_no_law_is_asked_for_around_a_poor_fit(
     monkeypatch.setattr(laws_on_delays, "_with_a_law", none)
     found = laws_on_delays.laws_on_delays(run, late, run.may_try)
     assert len(count) == asked and not found.laws and not len(found.unsure)
+
+
+@pytest.mark.parametrize(
+    ("chi2", "late", "other", "stands"),
+    [
+        (5.0, 1.4, None, True),
+        (30.0, 1.4, 1.1, True),
+        (5.0, 1.4, 1.1, False),
+        (5.0, 1.4, 1.6, True),
+        (1.2, 1.1, None, False),
+        (5.0, 6.0, None, False),
+        (5.0, None, None, False),
+    ],
+    ids=["better", "far", "other delays", "other and worse", "explained", "worse", "none"],
+)
+def test_delays_stand_where_a_search_explains_less(
+    chi2: float,
+    late: float | None,
+    other: float | None,
+    stands: bool,
+    noisy_problem: Problem,
+    noisy_refined: Refined,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Those of the local fit left more than noise. The search's fit may have better ones, or be explained."""
+
+    def delayed(value: float) -> DelayFit:
+        return _late(noisy_problem, dataclasses.replace(noisy_refined, chi2=value))
+
+    local, refined = (dataclasses.replace(noisy_refined, chi2=each) for each in (20.0, chi2))
+    asked = {20.0: late, chi2: other}
+    monkeypatch.setattr(
+        CalibrationRun,
+        "random_delays",
+        lambda of, fit: DelaysAsked(None if (value := asked[fit.chi2]) is None else delayed(value)),
+    )
+    monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda *_: (None, []))
+    run = dataclasses.replace(_run(noisy_problem, Validation()), local=local)
+    found = delays_before_search(run, run, refined)
+    assert (found is not None) == stands
+    assert found is None or found.late.fit.chi2 == late
+    unasked = dataclasses.replace(run, settings=Validation(diagnosis=False))
+    assert delays_before_search(unasked, unasked, refined) is None
