@@ -14,7 +14,7 @@ import dataclasses
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import (
+    MISMATCH_CHI2,
     WHITE_SAMPLES,
     uncertainty_at,
     with_rows,
@@ -58,10 +59,6 @@ from deal_hw.calibration import (
     ProgressCallback,
     StateStore,
 )
-
-if TYPE_CHECKING:
-    from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
-    from deal_hw.calib.validation.random_delay import DelayFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -247,40 +244,13 @@ class Refinement(Fits):
             # Short windows are easier to explain, so a shorter one is no evidence.
             if local.shooting.length >= refined.shooting.length:
                 refined = local
-        before = run
         run, refined = with_wider_ranges(run, refined, partial(_refined_again, run))
-        if (late := delays_before_search(before, run, refined)) is not None:
-            return conclude_fit(before, searched, late.late.before, attempt, late=late)
         if self.predictions is not None and far_from_noise(run, refined):
             run.say("fit", "no values explain the recordings, so fits of predictions follow, and the best")
             return self.predictions.continued(run, searched, refined)
         again = with_laws_tried(run, refined)
         found = None if again is run else with_explanation(again, searched)
         return found or conclude_fit(again, searched, refined, attempt)
-
-
-def delays_before_search(run: CalibrationRun, after: CalibrationRun, refined: Refined) -> LawsOnDelays | None:
-    """Return the local fit with random delays, and laws, where it explains what the search's fit does not.
-
-    That fit may show delays, too. Far from the noise they would explain what no parameters there do.
-
-    Args:
-        run: The calibration at its local fit.
-        after: The same with the ranges of the search's fit.
-        refined: The search's fit.
-    """
-    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
-    from deal_hw.calib.validation.explain import FAR
-
-    def delays(of: CalibrationRun, fit: Refined | None) -> DelayFit | None:
-        return None if fit is None or fit.chi2 > FAR else of.random_delays(fit).found
-
-    if not run.settings.diagnosis or refined.chi2 < RESTARTS.explained:
-        return None
-    late, other = delays(run, run.local), delays(after, refined)
-    if late is None or min(refined.chi2, np.inf if other is None else other.fit.chi2) <= late.fit.chi2:
-        return None
-    return laws_on_delays(run, late, run.allows)
 
 
 def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
@@ -322,6 +292,23 @@ def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refin
     return refined_from(dataclasses.replace(run, problem=problem), fit.theta, fit.latency_s)
 
 
+def best_of(fits: Fits, run: CalibrationRun) -> FitOutcome:
+    """Return a strategy's result, or the local fit with random delays, where that explains more.
+
+    Far from the noise delays would explain what no parameters there do.
+    """
+    from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
+    from deal_hw.calib.validation.explain import FAR
+
+    found, local = fits.best(run), run.local
+    if not run.settings.diagnosis or local is None or local.chi2 > FAR:
+        return found
+    late = run.random_delays(local).found
+    if late is None or not found.chi2 > max(late.fit.chi2, MISMATCH_CHI2):
+        return found
+    return conclude_fit(run, found.searched, local, late=laws_on_delays(run, late, run.allows))
+
+
 def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     """Return a strategy's result, with an alarm if commands and measurements share an error.
 
@@ -334,12 +321,12 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
     local = run.local
     asked = run.settings.diagnosis and run.settings.local_first
     if not asked or (local is not None and not unexplained(local, WHITE_SAMPLES)):
-        return fits.best(run)
+        return best_of(fits, run)
     checked = run.shared_error()
     suspect = checked.found
     if suspect is None:
         run.note_untried(checked)
-        return fits.best(run)
+        return best_of(fits, run)
     run.say(BEFORE_SEARCH, str(suspect.alarm))
     unchecked = Validation(split_half=False, physics_step=False, diagnosis=False)
     found = Refinement(ONE_SEARCH).best(dataclasses.replace(run, settings=unchecked))
@@ -347,7 +334,7 @@ def with_shared_error(fits: Fits, run: CalibrationRun) -> FitOutcome:
         rows = [suspect.candidate.to_json()]
         return found.with_alarms(suspect.alarm, shared_error=suspect.to_json(), candidates=rows)
     run.say(BEFORE_SEARCH, suspect.withdrawn)
-    return fits.best(run)
+    return best_of(fits, run)
 
 
 def report_unidentifiable(problem: Problem, local: Refined, progress: ProgressCallback) -> None:

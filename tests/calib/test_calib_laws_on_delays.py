@@ -20,7 +20,7 @@ from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit, without_search
 from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
 from deal_hw.calib.pipeline.methods import usual_budget
-from deal_hw.calib.pipeline.stages import delays_before_search
+from deal_hw.calib.pipeline.stages import Fits, best_of
 from deal_hw.calib.validation import checks
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_windows
@@ -218,44 +218,62 @@ def test_no_law_is_asked_for_around_a_poor_fit(
     assert len(count) == asked and not found.laws and not len(found.unsure)
 
 
+class Ended(Fits):
+    """A strategy that ends with a residual.
+
+    Args:
+        fit: The fit.
+        chi2: Its chi2.
+    """
+
+    def __init__(self, fit: Refined, chi2: float) -> None:
+        self.fit, self.chi2 = fit, chi2
+
+    def best(self, run: CalibrationRun) -> FitOutcome:
+        """Return the fit; see :meth:`Fits.best`."""
+        searched = without_search(run.problem, run.budget, self.fit)
+        known = uncertainty_at(run.problem, with_rows(self.fit))
+        return FitOutcome(
+            searched=searched,
+            theta=self.fit.theta,
+            latency_s=self.fit.latency_s,
+            chi2=self.chi2,
+            known=known,
+        )
+
+
 @pytest.mark.parametrize(
-    ("chi2", "late", "other", "stands"),
+    ("local", "late", "after", "stands"),
     [
-        (5.0, 1.4, None, True),
-        (30.0, 1.4, 1.1, True),
-        (5.0, 1.4, 1.1, False),
-        (5.0, 1.4, 1.6, True),
-        (1.2, 1.1, None, False),
-        (5.0, 6.0, None, False),
-        (5.0, None, None, False),
+        (20.0, 1.1, 27.0, True),
+        (20.0, 1.1, 1.2, False),
+        (20.0, 6.0, 5.0, False),
+        (20.0, None, 27.0, False),
+        (26.0, 1.1, 27.0, False),
     ],
-    ids=["better", "far", "other delays", "other and worse", "explained", "worse", "none"],
+    ids=["explains more", "both explain", "explains less", "none", "far from the noise"],
 )
-def test_delays_stand_where_a_search_explains_less(
-    chi2: float,
+def test_delays_of_the_local_fit_stand_where_a_search_explains_less(
+    local: float,
     late: float | None,
-    other: float | None,
+    after: float,
     stands: bool,
     noisy_problem: Problem,
     noisy_refined: Refined,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Those of the local fit left more than noise. The search's fit may have better ones, or be explained."""
-
-    def delayed(value: float) -> DelayFit:
-        return _late(noisy_problem, dataclasses.replace(noisy_refined, chi2=value))
-
-    local, refined = (dataclasses.replace(noisy_refined, chi2=each) for each in (20.0, chi2))
-    asked = {20.0: late, chi2: other}
-    monkeypatch.setattr(
-        CalibrationRun,
-        "random_delays",
-        lambda of, fit: DelaysAsked(None if (value := asked[fit.chi2]) is None else delayed(value)),
-    )
+    """They left more than noise, so the search followed; what it found is only taken if it is better."""
+    fit = None
+    if late is not None:
+        fit = _late(noisy_problem, dataclasses.replace(noisy_refined, chi2=late))
+    monkeypatch.setattr(CalibrationRun, "random_delays", lambda *_: DelaysAsked(fit))
     monkeypatch.setattr(laws_on_delays, "_with_a_law", lambda *_: (None, []))
-    run = dataclasses.replace(_run(noisy_problem, Validation()), local=local)
-    found = delays_before_search(run, run, refined)
-    assert (found is not None) == stands
-    assert found is None or found.late.fit.chi2 == late
+    run = dataclasses.replace(
+        _run(noisy_problem, Validation(split_half=False, physics_step=False)),
+        local=dataclasses.replace(noisy_refined, chi2=local),
+    )
+    found = best_of(Ended(noisy_refined, after), run)
+    names = [one["explanation"] for one in found.facts.get("candidates", []) if one["outcome"] == "taken"]
+    assert (found.chi2, names) == ((late, [LATE]) if stands else (after, []))
     unasked = dataclasses.replace(run, settings=Validation(diagnosis=False))
-    assert delays_before_search(unasked, unasked, refined) is None
+    assert best_of(Ended(noisy_refined, after), unasked).chi2 == after
