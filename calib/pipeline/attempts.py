@@ -30,7 +30,7 @@ Attempt: TypeAlias = Callable[[CalibrationRun, Refined], FitOutcome | Calibratio
 left then, otherwise the run with what it has learned."""
 
 
-def attempt(run: CalibrationRun, attempts: Sequence[Attempt]) -> FitOutcome | CalibrationRun:
+def first_outcome(run: CalibrationRun, attempts: Sequence[Attempt]) -> FitOutcome | CalibrationRun:
     """Return the outcome of the first attempt that has one; otherwise the run with what all have learned.
 
     Without a local fit there is nothing to explain.

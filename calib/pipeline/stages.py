@@ -31,7 +31,13 @@ from deal_hw.calib.fit.refinement import (
     Refined,
     local_fit,
 )
-from deal_hw.calib.pipeline.attempts import MODEL_HOLDS, MODEL_LACKS, attempt, with_explanation, with_weights
+from deal_hw.calib.pipeline.attempts import (
+    MODEL_HOLDS,
+    MODEL_LACKS,
+    first_outcome,
+    with_explanation,
+    with_weights,
+)
 from deal_hw.calib.pipeline.calibration_run import (
     EXPLANATIONS,
     CalibrationRun,
@@ -145,18 +151,18 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         if local is not None:
             run, local = with_wider_ranges(run, local, lambda of, fit: local_fit(of, offer, fit))
         run = dataclasses.replace(run, local=local)
-        found = attempt(run, MODEL_HOLDS)
+        found = first_outcome(run, MODEL_HOLDS)
         if isinstance(found, FitOutcome):
             found = with_doubted_recordings(run, given, narrow, found)
         else:
-            found = attempt(found, [with_weights])
+            found = first_outcome(found, [with_weights])
         if isinstance(found, CalibrationRun):
             fits = self.fits.started(found)
             if found.local is not None and progress is not None:
                 local = with_rows(found.local)
                 report_unidentifiable(found.problem, local, progress)
                 found = dataclasses.replace(found, local=local)
-            found = attempt(found, MODEL_LACKS)
+            found = first_outcome(found, MODEL_LACKS)
             if isinstance(found, CalibrationRun):
                 found = with_shared_error(fits, found)
         searched, known = found.searched, found.known
