@@ -101,6 +101,8 @@ class SafetyLimits:
         silence_s: The supervisor kills a control process without a heartbeat for this long [s].
         legs: For a robot with legs; None for others.
         climbing: In place of ``legs`` while a policy that observes a platform drives; None: the same.
+        may_be_blocked: Actuated joints that may push at their limit without moving, such as a gripper that
+            holds an object.
     """
 
     target: tuple[tuple[float, float], ...]
@@ -118,6 +120,7 @@ class SafetyLimits:
     silence_s: float = 0.3
     legs: LegLimits | None = None
     climbing: LegLimits | None = None
+    may_be_blocked: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

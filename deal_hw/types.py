@@ -10,13 +10,16 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+
+NOT_FOLLOWING: Final = "not following"
+"""Kind of the event that joints did not follow their commands: ``since_ns`` (host clock) and ``joints``."""
 
 
 class Status(enum.IntFlag):

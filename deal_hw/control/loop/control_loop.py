@@ -33,7 +33,7 @@ from deal_hw.motions.planned_end import ENDING_EVENT, PlannedEnd
 from deal_hw.robot import Robot
 from deal_hw.schema import plain
 from deal_hw.transport import Message
-from deal_hw.types import Event, JointCommand, RobotState
+from deal_hw.types import NOT_FOLLOWING, Event, JointCommand, RobotState
 
 HOME_TIMEOUT_S: Final = 20.0
 """Longest homing [s]."""
@@ -369,6 +369,8 @@ class ControlLoop:
         if self._robot.transport_errors > self._errors_seen:
             self._errors_seen = self._robot.transport_errors
             flags |= CycleFlag.LINK_ERROR
+        if (lost := verdict.unfollowed) is not None:
+            self.note(NOT_FOLLOWING, lost.reason, since_ns=lost.since_ns, joints=list(lost.joints))
         if verdict.state is SafetyState.PASSIVE:
             self._passive_flags = verdict.flags
             self.note("passive", verdict.reason, flags=list(verdict.flags))

@@ -42,6 +42,7 @@ SAFETY_FLAGS: Mapping[str, str] = {
     ),
     "device_watchdog": "The device stopped its motors because no commands arrived.",
     "device_disarmed": "The device reports that its motors do not follow commands.",
+    "not_following": "A joint does not follow its commands.",
     "position": "A joint is outside its trip range.",
     "velocity": "A joint is faster than its trip speed.",
     "state_not_finite": "The state contains NaN or infinity.",

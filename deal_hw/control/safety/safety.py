@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.control.safety.filter import SafetyFilter
+from deal_hw.control.safety.following import FollowingWatch, Unfollowed
 from deal_hw.control.safety.leg_checks import LegChecks
 from deal_hw.control.safety.machine import SafetyMachine, SafetyState, in_order
 from deal_hw.description import RobotDescription
@@ -83,6 +84,7 @@ class SafetyDecision:
         clipped: Names of the limits that changed the command.
         flags: Failed checks. While disarmed they do not trip.
         reason: Why it is passive, as text; "" otherwise.
+        unfollowed: Joints that were found not to follow in this cycle; None: none.
     """
 
     state: SafetyState
@@ -90,6 +92,7 @@ class SafetyDecision:
     clipped: tuple[str, ...]
     flags: tuple[str, ...]
     reason: str
+    unfollowed: Unfollowed | None = None
 
     @property
     def send(self) -> bool:
@@ -110,6 +113,7 @@ class Safety:
         self._machine = SafetyMachine(round(description.limits.ease_in_s * 1e9))
         legs = description.limits.legs
         self._legs = None if legs is None else LegChecks(description, legs)
+        self._following = FollowingWatch(description)
         self._command_age_ns = 0 if legs is None else round(legs.command_age_s * 1e9)
         self._index = list(description.actuated_index)
         self._errors_due = (
@@ -127,6 +131,9 @@ class Safety:
         self._offset_at_ns = 0
         self._errors: deque[tuple[int, int]] = deque()
         self._first_ns: int | None = None
+        self._in_force: JointCommand | None = None
+        self._unfollowed: Unfollowed | None = None
+        self._following.reset()
         if self._legs is not None:
             self._legs.reset()
 
@@ -163,9 +170,12 @@ class Safety:
         state = self._machine.update(cycle.now_ns, flags)
         if was_armed and not state.armed:
             self.reason = "; ".join(failures[name] for name in flags)
+        unfollowed, self._unfollowed = self._unfollowed, None
         if state is SafetyState.PASSIVE or wanted is None or cycle.state is None or unsound:
-            return SafetyDecision(state, None, (), flags, self.reason)
+            self._in_force = None
+            return SafetyDecision(state, None, (), flags, self.reason, unfollowed)
         command, clipped = self._clip(cycle.now_ns, wanted, cycle.state)
+        self._in_force = command if state.armed else None
         return SafetyDecision(state, command, clipped, flags, self.reason)
 
     def stop(self, reason: str) -> None:
@@ -222,6 +232,7 @@ class Safety:
             self._check_age(cycle.now_ns, cycle.state, found)
             self._check_status(cycle.now_ns, cycle.state.status, found)
             self._check_motion(cycle.state, found)
+            self._check_following(cycle.state, found)
             if self._legs is not None:
                 found |= self._legs.failures(cycle.state, arming=arming)
         if wanted is not None and not self._filter.accepts(wanted):
@@ -283,6 +294,15 @@ class Safety:
                 found["velocity"] = (
                     f"joint {names[j]!r} moves at {state.velocity[j]:.2f} {units[j]}/s, faster than {most:g}"
                 )
+
+    def _check_following(self, state: RobotState, found: dict[str, str]) -> None:
+        # Without a command in force nothing says where the joints are to be.
+        if self._in_force is None or "state_not_finite" in found:
+            return
+        position, velocity = state.position[self._index], state.velocity[self._index]
+        self._unfollowed = self._following.step(state.receive_ns, position, velocity, self._in_force)
+        if self._unfollowed is not None:
+            found["not_following"] = self._unfollowed.reason
 
     def _check_link(self, now_ns: int, errors: int, found: dict[str, str]) -> None:
         window = self._errors

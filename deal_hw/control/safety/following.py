@@ -1,0 +1,287 @@
+"""Does each joint follow its commands? Judged from the drive's own law, without a model of the robot.
+
+A position drive pushes with stiffness x (set-point - position), up to its effort limit. So a reading that is
+away from its set-point says how hard the drive pushes, if it is on and reads the same. A joint that is pushed
+harder than its usual load asks for must move that way, or gain speed that way. One that does not is blocked,
+or its drive is off, or the reading is not that of this joint.
+
+What counts is the push over time. At the drive's limit it is noticed after 0.36 s, at a third of the limit
+after 1 s, at the least push after 2 s. A leg that never reaches its set-point under load follows: its load is
+usual. A joint that moves at its limit follows, too. Two kinds of wrong readings are found in another way: a
+reading that jumps faster than the joint can move, and readings that fit the set-point of another joint, or
+the own one with the other sign.
+
+Pure: no I/O, and time is an argument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from deal_hw.description import RobotDescription
+from deal_hw.types import FloatArray, IntArray, JointCommand
+
+BoolArray = npt.NDArray[np.bool_]
+
+PUSH_S: Final = 0.3
+"""A push at the drive's limit without motion for this long, or a smaller one for longer, is no following [s].
+tools/measure_following.py has what shipped motions reach. On recordings of a real SO-101 it is at most 0.09
+with the description's stiffness, and 0.3 with 1.6 times as much (isaac-sim2real/sage, eight motions)."""
+LEAST_PUSH: Final = 0.15
+"""A smaller share of the drive's limit beyond the usual load does not count: friction, or a new load."""
+LOAD_S: Final = 1.0
+"""The usual load follows the push with this time constant [s]."""
+DEAD_S: Final = 0.06
+"""A push counts after this time in one direction [s]: a command takes some 10 to 40 ms to act."""
+FORGET: Final = 0.02
+"""Without a push, the counted one falls by this much a second."""
+LEAST_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.2, "m": 0.04})
+"""No drive reaches its limit at a smaller error: a model's stiffness is often far above the real one."""
+UNKNOWN_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.5, "m": 0.1})
+"""The same of a drive whose effort limit is unknown."""
+MOVED: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.02, "m": 0.004})
+FASTER: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.2, "m": 0.04})
+"""Motion, or gain of speed, in the direction of the push by which a joint follows [rad, m; rad/s, m/s]."""
+JUMP: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.05, "m": 0.01})
+JUMP_SPEEDS: Final = 2.0
+"""A reading that changes by more than this, plus this many times the trip speed, has jumped [rad or m]."""
+ELSEWHERE: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.12, "m": 0.024})
+FITS: Final = 0.15
+"""A reading that is so far from its own set-point, and at most this share of it from another one, is not the
+joint's own; both are means over some tenths of a second, of slow motion [rad or m]."""
+SLOW_S: Final = 0.1
+MEAN_S: Final = 0.5
+_LONGEST_STEP_S: Final = 0.1
+"""Time that a step counts at most [s]: after a pause of this computer nobody knows what was in force."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unfollowed:
+    """Joints that do not follow.
+
+    Attributes:
+        joints: Their names.
+        since_ns: Time of the last state by which they followed, on the clock of the steps [ns].
+        reason: What was seen, what it means and what to do, for the operator.
+    """
+
+    joints: tuple[str, ...]
+    since_ns: int
+    reason: str
+
+
+class FollowingWatch:
+    """Watches the actuated joints of one robot, state by state; arrays are (A,) in the order of commands.
+
+    Joints with commands of effort (``actuation`` "motor") are not watched: no set-point says where they are
+    to be. A joint of ``limits.may_be_blocked`` is not watched for pushes.
+
+    Attributes:
+        worst: Largest push without motion so far, as a time at the drive's limit [s]; ``PUSH_S`` trips.
+
+    Args:
+        description: The robot.
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        d, index = description, list(description.actuated_index)
+        units = [d.position_units[j] for j in index]
+
+        def by_unit(table: Mapping[str, float]) -> FloatArray:
+            return np.array([table[unit] for unit in units])
+
+        self._names, self._units = d.actuated, units
+        self._watched = d.actuation == "position"
+        limit = np.array(d.effort_limit, dtype=float)
+        self._limited = np.isfinite(limit)
+        self._limit = np.where(self._limited, limit, 0.0)
+        self._most = np.where(self._limited, limit, 1.0)
+        self._reach = np.where(self._limited, by_unit(LEAST_REACH), by_unit(UNKNOWN_REACH))
+        self._moved, self._faster = by_unit(MOVED), by_unit(FASTER)
+        self._jump, self._elsewhere = by_unit(JUMP), by_unit(ELSEWHERE)
+        self._speed = np.array(d.limits.trip_velocity, dtype=float)[index]
+        self._may_be_blocked = np.isin(d.actuated, d.limits.may_be_blocked)
+        self._like = np.equal.outer(units, units) & ~np.eye(len(units), dtype=bool)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past, as on arming."""
+        self._now_ns: int | None = None
+        self.worst = 0.0
+
+    def step(
+        self, now_ns: int, position: FloatArray, velocity: FloatArray, command: JointCommand
+    ) -> Unfollowed | None:
+        """Judge a new state.
+
+        Args:
+            now_ns: Its time, by a clock that does not go back [ns].
+            position: Measured positions, (A,) [rad or m].
+            velocity: Measured velocities, (A,) [rad/s or m/s].
+            command: The command in force when it was measured.
+
+        Returns:
+            The joints that do not follow; None where all follow, or nothing can be said.
+        """
+        if not self._watched:
+            return None
+        if self._now_ns is None:
+            self._begin(now_ns, position, velocity, command)
+            return None
+        passed_s = min((now_ns - self._now_ns) * 1e-9, _LONGEST_STEP_S)
+        if passed_s <= 0.0:
+            return None
+        self._now_ns = now_ns
+        # A drive with a set-point generator moves its set-point at most this fast.
+        travel = command.speed_limit * passed_s
+        self._setpoint = self._setpoint + np.clip(command.position_target - self._setpoint, -travel, travel)
+        return (
+            self._jumped(position, passed_s)
+            or self._pushed(now_ns, position, velocity, command, passed_s)
+            or self._misread(now_ns, position, command, passed_s)
+        )
+
+    def _begin(self, now_ns: int, position: FloatArray, velocity: FloatArray, command: JointCommand) -> None:
+        self._now_ns = now_ns
+        self._setpoint = command.position_target.copy()
+        count = len(position)
+        self._load = self._share(position, command)
+        self._way = np.zeros(count)
+        self._way_s, self._counted = np.zeros(count), np.zeros(count)
+        self._from, self._from_velocity = position.copy(), velocity.copy()
+        self._followed_ns, self._near_ns = np.full(count, now_ns), np.full(count, now_ns)
+        self._before, self._odd = position.copy(), np.zeros(count, dtype=bool)
+        self._slow = [position.copy(), position.copy(), self._setpoint.copy(), self._setpoint.copy()]
+        self._off = np.zeros((count, count))
+        self._off_turned = np.zeros(count)
+
+    def _share(self, position: FloatArray, command: JointCommand) -> FloatArray:
+        """Return the drives' pushes as shares of their limits, with sign, (A,)."""
+        stiffness = command.stiffness
+        most = np.maximum(self._limit, stiffness * self._reach)
+        push = stiffness * (self._setpoint - position) + command.effort
+        share = np.divide(push, most, out=np.zeros(len(most)), where=most > 0)
+        # A command may allow less than the drive's limit.
+        allowed = np.where(self._limited, np.minimum(command.effort_limit / self._most, 1.0), 1.0)
+        return np.clip(share, -allowed, allowed)
+
+    def _pushed(
+        self, now_ns: int, position: FloatArray, velocity: FloatArray, command: JointCommand, passed_s: float
+    ) -> Unfollowed | None:
+        """Count pushes beyond the usual load that move nothing."""
+        share = self._share(position, command)
+        way = np.sign(share)
+        beyond = np.minimum(np.abs(share), way * (share - self._load))
+        # At its limit a drive has nothing left, whatever its load is.
+        beyond = np.where(np.abs(share) > 0.999, 1.0, beyond)
+        pushes = beyond > LEAST_PUSH
+        turned = ~pushes | (way != self._way)
+        self._way_s = np.where(turned, 0.0, self._way_s + passed_s)
+        self._way = np.where(pushes, way, 0.0)
+        moved = way * (position - self._from) >= self._moved
+        faster = way * (velocity - self._from_velocity) >= self._faster
+        follows = pushes & ~turned & (moved | faster)
+        anew = turned | follows
+        self._from = np.where(anew, position, self._from)
+        self._from_velocity = np.where(anew, velocity, self._from_velocity)
+        idle = np.maximum(self._counted - FORGET * passed_s, 0.0)
+        counts = pushes & (self._way_s >= DEAD_S) & ~self._may_be_blocked
+        self._counted = np.where(counts, self._counted + beyond * passed_s, idle)
+        self._counted[follows] = 0.0
+        doubtful = self._odd | (self._counted > 0.0) | (pushes & ~follows)
+        self._followed_ns = np.where(doubtful, self._followed_ns, now_ns)
+        self._load = self._load + (share - self._load) * min(passed_s / LOAD_S, 1.0)
+        self.worst = max(self.worst, float(self._counted.max()))
+        late = self._counted >= PUSH_S
+        if not late.any():
+            return None
+        worst = int(np.argmax(np.where(late, self._counted, -1.0)))
+        off = self._setpoint[worst] - position[worst]
+        return self._unfollowed(
+            late,
+            self._followed_ns,
+            f"joint {self._names[worst]!r} does not follow: its set-point is {abs(off):.2f} "
+            f"{self._units[worst]} away, so its drive should push with {abs(share[worst]):.0%} of its limit, "
+            "but the joint does not move that way. It is blocked, its drive is off or limp, or its reading "
+            "stands still; look at it before the next run",
+        )
+
+    def _jumped(self, position: FloatArray, passed_s: float) -> Unfollowed | None:
+        """Find readings that changed faster than a joint can move, and stayed so for a second state."""
+        far = np.abs(position - self._before) > self._jump + JUMP_SPEEDS * self._speed * passed_s
+        jumped = far & self._odd
+        # After one odd reading the next one is compared with that before it.
+        self._before = np.where(far & ~self._odd, self._before, position)
+        self._odd = far
+        if not jumped.any():
+            return None
+        names = ", ".join(repr(name) for name, hit in zip(self._names, jumped, strict=True) if hit)
+        return self._unfollowed(
+            jumped,
+            self._followed_ns,
+            f"the reading of joint {names} jumped, faster than the joint can move: an encoder slipped, "
+            "readings were exchanged, or something moved it by force; look at it before the next run",
+        )
+
+    def _misread(
+        self, now_ns: int, position: FloatArray, command: JointCommand, passed_s: float
+    ) -> Unfollowed | None:
+        """Find readings that fit another joint's set-point, or the own one with the other sign."""
+        slow = 1.0 - np.exp(-passed_s / SLOW_S)
+        once, twice, target_once, target_twice = self._slow
+        once = once + slow * (position - once)
+        twice = twice + slow * (once - twice)
+        target_once = target_once + slow * (self._setpoint - target_once)
+        target_twice = target_twice + slow * (target_once - target_twice)
+        self._slow = [once, twice, target_once, target_twice]
+        mean = 1.0 - np.exp(-passed_s / MEAN_S)
+        self._off += mean * (np.subtract.outer(twice, target_twice) ** 2 - self._off)
+        self._off_turned += mean * ((twice + target_twice) ** 2 - self._off_turned)
+        near = np.abs(position - self._setpoint) < self._elsewhere
+        self._near_ns = np.where(near, now_ns, self._near_ns)
+        # A drive that is set to be weak may stay behind.
+        weak = self._limited & (command.effort_limit < 0.5 * self._limit)
+        self._off[weak] = 0.0
+        self._off_turned[weak] = 0.0
+        own = np.sqrt(np.diag(self._off))
+        far = own >= self._elsewhere
+        if not far.any():
+            return None
+        turned = far & (np.sqrt(self._off_turned) <= FITS * own)
+        if turned.any():
+            name = self._names[int(np.argmax(turned))]
+            return self._unfollowed(
+                turned,
+                self._near_ns,
+                f"joint {name!r} does not follow: its reading is its set-point with the other sign. Its "
+                "encoder or its direction is turned; correct it before the next run",
+            )
+        fits = self._like & far[:, None] & (np.sqrt(self._off) <= FITS * own[:, None])
+        exchanged = fits & fits.T
+        if not exchanged.any():
+            return None
+        first, second = (int(k) for k in np.argwhere(exchanged)[0])
+        return self._unfollowed(
+            exchanged.any(axis=1),
+            self._near_ns,
+            f"joint {self._names[first]!r} does not follow: its reading fits the set-point of "
+            f"{self._names[second]!r}, and that one's fits its own. The two are exchanged: in the order of "
+            "joints, in cables or in ids",
+        )
+
+    def _unfollowed(self, which: BoolArray, last_ns: IntArray, reason: str) -> Unfollowed:
+        """Return what was found about some joints.
+
+        Args:
+            which: The joints, as a mask, (A,).
+            last_ns: When each followed last, (A,) [ns].
+            reason: As in the result.
+        """
+        names = tuple(name for name, hit in zip(self._names, which, strict=True) if hit)
+        return Unfollowed(names, int(last_ns[which].min()), reason)
