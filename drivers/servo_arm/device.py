@@ -19,6 +19,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
+from deal_hw.testing.joint_faults import FaultyJoints, JointFaults
 from deal_hw.types import FloatArray
 
 BRAKE: Final = 0.55
@@ -49,6 +50,7 @@ class ArmDevice:
         bus: Their bus.
         faults: Faults of one servo.
         noisy: Whether positions have the noise of the robot's description.
+        joint_faults: Faults of the joints.
 
     Raises:
         ConfigurationError: No servo has the id of the faulty one.
@@ -65,6 +67,7 @@ class ArmDevice:
         *,
         faults: ArmFaults | None = None,
         noisy: bool = True,
+        joint_faults: JointFaults | None = None,
     ) -> None:
         self.joints, self.bus, self.received_bytes = tuple(joints), bus, 0
         d = robot.description
@@ -78,6 +81,7 @@ class ArmDevice:
         self._dofs = list(robot.qvel)
         self._of_id = {servo.id: j for j, servo in enumerate(self._servos)}
         self._due = self._schedule(faults or ArmFaults())
+        self._joint_faults = FaultyJoints(joint_faults or JointFaults(), d.joint_names, d.actuated_index)
         self._first_ns: int | None = None
         limits = dict(zip(d.actuated, d.effort_limit, strict=True))
         # Without a limit nothing says what share of the voltage an effort takes.
@@ -151,7 +155,7 @@ class ArmDevice:
     def trouble(self) -> str:
         """Current fault of a servo; "" for none."""
         found = (joint.trouble(self._now_ns) for joint in self.joints)
-        return next((trouble for trouble in found if trouble), "")
+        return next((trouble for trouble in found if trouble), self._joint_faults.now)
 
     @property
     def frame_errors(self) -> int:
@@ -216,6 +220,10 @@ class ArmDevice:
         now_ns = self._tick * self._tick_ns
         if self._due:
             self._fail()
+        if self.armed:
+            self._joint_faults.begin(now_ns)
+        if self._joint_faults.advance(now_ns):
+            self._stale = True
         for joint in self.joints:
             joint.tick(now_ns, now_ns - self.bus.alive_ns)
         while self._coming and self._coming[0][0] <= self._tick:
@@ -223,7 +231,10 @@ class ArmDevice:
         if self._stale:
             self._command()
             self._stale = False
+        before = self._batch.position.copy()
         self._batch.advance(self._setpoint[None, None, self._actuated])
+        if self._joint_faults.held:
+            self._batch.set_state(before, np.zeros_like(before))
         self._hold()
         self._take_state()
         self._tick += 1
@@ -274,6 +285,8 @@ class ArmDevice:
                 self._setpoint[j] = self._held.setdefault(int(j), float(self._position[j]))
             else:
                 self._held.pop(int(j), None)
+        if self._joint_faults.limp:
+            kp, kd = np.zeros_like(kp), np.zeros_like(kd)
         sent = (*kp, *kd, *effort)
         if sent != self._sent:
             self._sent = sent
@@ -295,9 +308,15 @@ class ArmDevice:
 
         A servo samples faster than a physics step: between two steps the joint moves on at its velocity.
         """
+        faults = self._joint_faults
+        if faults.frozen[j]:
+            return
         joint, servo = self.joints[j], self._servos[j]
-        velocity = float(self._velocity[j])
-        position = float(self._position[j]) + 1e-9 * (now_ns - self._tick * self._tick_ns) * velocity
+        shown, sign = int(faults.source[j]), float(faults.sign[j])
+        velocity = sign * float(self._velocity[shown])
+        position = (
+            sign * float(self._position[shown]) + 1e-9 * (now_ns - self._tick * self._tick_ns) * velocity
+        )
         if self._noisy:
             position += self._rng.standard_normal() * self._description.sensor.noise[j]
         most = self._most[j]

@@ -10,6 +10,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.robots.hardware_section import HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
+from deal_hw.testing.joint_faults import JointFaults
 
 
 def arm_device(
@@ -20,6 +21,7 @@ def arm_device(
     *,
     faults: ArmFaults | None = None,
     noisy: bool = True,
+    joint_faults: JointFaults | None = None,
 ) -> ArmDevice:
     """Return an emulated arm.
 
@@ -30,9 +32,20 @@ def arm_device(
         truth: Their hidden values.
         faults: Faults of one servo.
         noisy: Whether positions have the noise of the description.
+        joint_faults: Faults of the joints.
     """
     by_joint = {servo.joint: servo for servo in hardware.servos}
     servos = [by_joint[name] for name in description.joint_names]
     joints, bus = EMULATED[hardware.bus](servos, hardware.baud_rate)
     robot = load_model(description)
-    return ArmDevice(hardware, robot, space, truth, joints, bus, faults=faults, noisy=noisy)
+    return ArmDevice(
+        hardware,
+        robot,
+        space,
+        truth,
+        joints,
+        bus,
+        faults=faults,
+        noisy=noisy,
+        joint_faults=joint_faults,
+    )

@@ -14,12 +14,19 @@ from deal_hw.drivers.so101.description import DRIVEN, emulated_space
 from deal_hw.drivers.so101.robot import HARDWARE, RANGES, UNSWEPT
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection, ServoEntry
 from deal_hw.sim.robots.simulated import SimulatedTruth
+from deal_hw.testing.joint_faults import JointFaults
 
 HOMED: Final = 2047
 """What LeRobot's homing makes of the middle of a joint's travel [ticks]."""
 
 
-def so101_device(truth: SimulatedTruth, *, faults: ArmFaults | None = None, noisy: bool = True) -> ArmDevice:
+def so101_device(
+    truth: SimulatedTruth,
+    *,
+    faults: ArmFaults | None = None,
+    noisy: bool = True,
+    joint_faults: JointFaults | None = None,
+) -> ArmDevice:
     """Return an emulated arm, whose servos keep the ends of their travels as LeRobot writes them.
 
     A joint's encoder bias is that its middle was not found exactly: the servo's limits are off by it.
@@ -28,9 +35,12 @@ def so101_device(truth: SimulatedTruth, *, faults: ArmFaults | None = None, nois
         truth: Values of the parameters of :func:`~deal_hw.drivers.so101.description.emulated_space`.
         faults: Faults of one servo.
         noisy: Whether positions have the noise of the description.
+        joint_faults: Faults of the joints.
     """
     hardware = homed()
-    device = arm_device(hardware, DRIVEN, emulated_space(), truth, faults=faults, noisy=noisy)
+    device = arm_device(
+        hardware, DRIVEN, emulated_space(), truth, faults=faults, noisy=noisy, joint_faults=joint_faults
+    )
     for servo, emulated in zip(hardware.servos, device.bus.servos, strict=True):
         low, high = limits_of(servo)
         emulated.keep(f.MIN_POSITION, low)

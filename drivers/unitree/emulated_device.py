@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from deal_hw.drivers.unitree.emulated_truth import JointTruth
 from deal_hw.drivers.unitree.motor_command import MotorCommand
 from deal_hw.errors import FrameError
 from deal_hw.sim.legged.simulation import LeggedSimulation
+from deal_hw.testing.joint_faults import HELD_DAMPING, FaultyJoints
 from deal_hw.types import FloatArray
 
 TICK_NS: Final = 1_000_000
@@ -49,6 +51,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         truth: Hidden parameters.
         profile: Differences from ideal sensors and motors.
         plan: Faults to make.
+        joints: Names of the joints, J.
         written: Topics that it may write; the last one is its own controller's.
         jitter_rng: Draws the delays of commands.
         fault_rng: Draws the faults of states.
@@ -68,6 +71,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         profile: SensorProfile,
         plan: WirePlan,
         *,
+        joints: Sequence[str],
         written: tuple[str, ...],
         jitter_rng: np.random.Generator,
         fault_rng: np.random.Generator,
@@ -83,6 +87,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         self._jitter_rng = jitter_rng
         self._service_of = {topics.request(name): name for name in topics.SERVICES}
         self._state_faults = StateFaults(plan, fault_rng)
+        self._joint_faults = FaultyJoints(plan.joints, joints, range(len(joints)))
         self._due = deque(plan.due())
         self._inbox: list[tuple[str, bytes, int]] = []
         self._commands: deque[tuple[int, CommandT]] = deque()
@@ -132,6 +137,8 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         out += self._command_drives(now)
         velocity = self._sim.velocity()
         self._motors.update(self._sim.position(), velocity)
+        if self._joint_faults.limp or self._joint_faults.held:
+            self._motors.give_no_torque()
         if now % STATE_MS == 0:
             self._motors.warm(STATE_MS * 1e-3)
         out += self._reports(now)
@@ -211,13 +218,18 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         if self.log.first_stiff_ms is not None:
             while self._due and self._due[0][0] <= now:
                 self.begin_fault(self._due.popleft()[1])
+            now_ns = now * TICK_NS
+            self._joint_faults.begin(now_ns)
+            if (event := self._joint_faults.advance(now_ns)) is not None:
+                self.log.begin(event or "sound joints", now, self.host_origin_ns + now_ns)
 
     def _move(self, velocity: FloatArray) -> None:
         """Run a physics step with the present motor efforts, from these velocities (J,)."""
         if self._profile.stribeck_ratio:
             slow = np.exp(-np.square(velocity / self._profile.stribeck_rad_s))
             self._sim.set_frictionloss(self._friction * (1.0 + self._profile.stribeck_ratio * slow))
-        self._sim.set_damping(self._joint_damping + self._motors.brake)
+        held = HELD_DAMPING if self._joint_faults.held else 0.0
+        self._sim.set_damping(self._joint_damping + self._motors.brake + held)
         self._sim.step(self._motors.constant)
 
     def _settle(self, ticks: int) -> None:

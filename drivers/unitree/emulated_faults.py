@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final
 
 import numpy as np
+
+from deal_hw.testing.joint_faults import JointFaults
 
 SHARES: Final = ("drop", "duplicate", "reorder", "corrupt")
 
@@ -40,6 +42,9 @@ class WirePlan:
 
     cut_s: float = 1.0
     """How long the wire is cut [s]."""
+
+    joints: JointFaults = field(default_factory=JointFaults)
+    """Faults of the joints."""
 
     def due(self) -> list[tuple[int, str]]:
         """Return the start of each fault, in ms since the first stiff command, and its name, in order."""

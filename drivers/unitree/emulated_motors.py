@@ -83,6 +83,10 @@ class PdMotors:
         self._alive[joint] = 0.0
         self._any_dead = True
 
+    def give_no_torque(self) -> None:
+        """Make this step's efforts 0; the commands stay."""
+        self.effort, self.constant, self.brake = np.zeros((3, len(self.effort)))
+
     def update(self, position: FloatArray, velocity: FloatArray) -> None:
         """Compute the efforts for true positions and velocities, (J,).
 

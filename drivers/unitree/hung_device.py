@@ -106,6 +106,7 @@ class HungDevice(UnitreeDevice[CommandT]):
             truth,
             p,
             plan,
+            joints=self._joints,
             written=PUBLISHED,
             jitter_rng=jitter_rng,
             fault_rng=fault_rng,
@@ -221,7 +222,7 @@ class HungDevice(UnitreeDevice[CommandT]):
         position = sim.position() + self._bias + noise[0]
         if p.position_resolution:
             position = np.rint(position / p.position_resolution) * p.position_resolution
-        velocity = sim.velocity() + noise[1]
+        position, velocity = self._joint_faults.read(position, sim.velocity() + noise[1])
         if self._broken >= 0:
             position[self._broken] = velocity[self._broken] = math.nan
         orientation, angular_velocity, specific_force = self._true_body()

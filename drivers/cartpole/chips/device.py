@@ -11,8 +11,10 @@ import numpy as np
 
 from deal_hw.drivers.cartpole.chips.controller import Controller, Firmware, Mode
 from deal_hw.drivers.cartpole.chips.servo import Servo
+from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.plant.mechanics import Mechanics
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, unique_id
+from deal_hw.testing.joint_faults import FaultyJoints, JointFaults
 from deal_hw.types import FloatArray
 
 TICK_NS = 1_000_000
@@ -89,7 +91,12 @@ class EmulatedDevice(abc.ABC):
     @property
     def trouble(self) -> str:
         """Current fault of its wire or its motors; "" for none."""
-        return ""
+        return self._mechanics.joint_faults.now
+
+    def break_joints(self, faults: JointFaults) -> None:
+        """Give the joints faults, whose times count from the first arming."""
+        d = DESCRIPTION
+        self._mechanics.joint_faults = FaultyJoints(faults, d.joint_names, d.actuated_index)
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host; the next tick handles them."""

@@ -46,4 +46,5 @@ def dynamixel_emulator(truth: CartpoleTruth, *, link: Path | None, hazards: Haza
     """Return an emulated cart-pole on two servos."""
     settings = DynamixelSettings(baud_rate=hazards.servo.servo_baud_rate)
     device = DynamixelDevice(truth, settings, hazards.servo)
+    device.break_joints(hazards.joints)
     return ServoEmulator(device, link, hazards)

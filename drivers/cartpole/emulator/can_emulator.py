@@ -80,6 +80,8 @@ def adapter_emulator(
         hazards: Faults on purpose.
         port: Converts the path to a host's ``--port``.
     """
+    for device in devices:
+        device.break_joints(hazards.joints)
     return PseudoTerminal(
         SlcanAdapter(devices, hazards.can), link, hazards, port=lambda path: port(f"slcan:{path}")
     )

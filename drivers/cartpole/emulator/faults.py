@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from deal_hw.ranges import Checked, Range
+from deal_hw.testing.joint_faults import JointFaults
 from deal_hw.testing.pseudo_terminal import PortFaults
 
 
@@ -77,7 +78,9 @@ class Hazards(PortFaults):
     Attributes:
         can: A CAN bus and its faults.
         servo: Dynamixel servos and their faults.
+        joints: Faults of the joints.
     """
 
     can: CanFaults = CanFaults()
     servo: ServoFaults = ServoFaults()
+    joints: JointFaults = field(default_factory=JointFaults)

@@ -18,4 +18,6 @@ def serial_emulator(
     Raises:
         ConfigurationError: Its firmware needs a compiler, which is missing.
     """
-    return PseudoTerminal(device_of(truth, firmware), link, hazards)
+    device = device_of(truth, firmware)
+    device.break_joints(hazards.joints)
+    return PseudoTerminal(device, link, hazards)

@@ -13,6 +13,7 @@ from deal_hw.drivers.cartpole.plant.profiles import profile as find_profile
 from deal_hw.drivers.cartpole.plant.sensor import Motor, Reading, Sample, Sensor
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.sim.engine.single import SingleSimulation
+from deal_hw.testing.joint_faults import FaultyJoints, JointFaults
 
 HOMING_TICKS: Final = 500
 START_ANGLE_RAD: Final = 0.03
@@ -45,6 +46,7 @@ class Mechanics:
     Attributes:
         homing: Whether the hand is moving them to the start pose.
         held: Whether it holds them there.
+        joint_faults: Faults of the joints; their times count from the first :meth:`release`.
 
     Args:
         truth: Hidden parameters, latency, profile and seed.
@@ -60,6 +62,8 @@ class Mechanics:
         read_rate_hz: float = DESCRIPTION.state_rate_hz,
     ) -> None:
         self.homing = self.held = False
+        self.joint_faults = FaultyJoints(JointFaults(), DESCRIPTION.joint_names, (_CART,))
+        self._ticks = 0
         self._profile = find_profile(truth.profile)
         streams = [np.random.default_rng(s) for s in np.random.SeedSequence([truth.seed, 0xCA47]).spawn(4)]
         self._hand_rng, sensor_rng, self._jitter_rng, self._drop_rng = streams
@@ -116,7 +120,12 @@ class Mechanics:
 
     def read(self) -> Reading:
         """Return the sensors' readings: delayed, noisy and quantised as in the profile."""
-        return self._sensor.read()._replace(at_end_stop=abs(self._now[0][_CART]) >= _END_STOP_M)
+        seen = self._sensor.read()._replace(at_end_stop=abs(self._now[0][_CART]) >= _END_STOP_M)
+        position, velocity = self.joint_faults.read(
+            np.array((seen.cart_um, seen.pole_urad)), np.array((seen.cart_um_s, seen.pole_urad_s))
+        )
+        cart, pole, cart_s, pole_s = (int(value) for value in (*position, *velocity))
+        return seen._replace(cart_um=cart, pole_urad=pole, cart_um_s=cart_s, pole_urad_s=pole_s)
 
     def loses_frame(self) -> bool:
         """Draw whether a state frame is lost."""
@@ -137,11 +146,20 @@ class Mechanics:
     def release(self) -> None:
         """Let go of cart and pole."""
         self.homing = self.held = False
+        self.joint_faults.begin(self._now_ns)
+
+    @property
+    def _now_ns(self) -> int:
+        return round(self._ticks * self.timestep_s * 1e9)
 
     def step(self, force: float) -> bool:
         """Hold a force on the cart for one tick [N]; return whether the hand reached the start pose."""
-        if self.held:
+        self._ticks += 1
+        self.joint_faults.advance(self._now_ns)
+        if self.held or self.joint_faults.held:
             return False
+        if self.joint_faults.limp:
+            force = 0.0
         if self.homing:
             return self._move_home()
         if self._stribeck_ratio:

@@ -88,6 +88,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
             truth,
             profile,
             self._plan,
+            joints=JOINTS,
             written=PUBLISHED,
             jitter_rng=jitter_rng,
             fault_rng=fault_rng,
@@ -96,7 +97,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
         self._sim.add_payload(truth.payload_kg)
         self._sim.set_floor_friction(truth.floor_friction)
         self._motors = Motors(truth, profile)
-        self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng)
+        self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng, self._joint_faults)
         self._sport = SportMode(machine, sport)
         self._services = ServiceServer(self._sport)
         self.sport_on_wire = sport_on_wire

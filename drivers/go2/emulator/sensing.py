@@ -12,6 +12,7 @@ from deal_hw.drivers.unitree.emulated_imu import roll_pitch_yaw, turned
 from deal_hw.drivers.unitree.emulated_quadruped import BatteryFacts, QuadrupedProfile, QuadrupedTruth
 from deal_hw.drivers.unitree.go_messages.low_state import LowState
 from deal_hw.sim.legged.simulation import LeggedSimulation
+from deal_hw.testing.joint_faults import FaultyJoints
 from deal_hw.types import FloatArray
 
 _CELL_V: Final = 3.7
@@ -69,6 +70,7 @@ class Sensing:
         truth: Encoder biases, and the battery.
         profile: Noise and resolution.
         rng: Source of the noise.
+        joints: Faults of the joints.
     """
 
     def __init__(
@@ -78,7 +80,9 @@ class Sensing:
         truth: QuadrupedTruth,
         profile: QuadrupedProfile,
         rng: np.random.Generator,
+        joints: FaultyJoints,
     ) -> None:
+        self._joint_faults = joints
         self.battery = Battery(truth.machine.battery)
         self.hot: int | None = None
         self.broken: int | None = None
@@ -116,7 +120,7 @@ class Sensing:
         position = sim.position() + self._bias + noise[0:12]
         if self._resolution:
             position = np.rint(position / self._resolution) * self._resolution
-        velocity = sim.velocity() + noise[12:24]
+        position, velocity = self._joint_faults.read(position, sim.velocity() + noise[12:24])
         temperature = motors.temperature.astype(np.int64)
         if self.hot is not None:
             temperature[self.hot] = _HOT_C
