@@ -9,8 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.testing.faults import FaultRates, FrameFaults
+from deal_hw.testing.joint_faults import JointFaults
 from deal_hw.testing.pseudo_terminal import PortFaults, PseudoTerminal, SteppedDevice
 
 
@@ -35,6 +37,8 @@ class EmulatorRequest:
         vanish_after_s: The pseudo-terminal vanishes this long after the first command; None: never [s].
         return_after_s: It comes back under the link this long after that; None: it does not [s].
         servos: Faults of the servos of an arm.
+        joints: Faults of the joints.
+        controller: Faults of a controller of ros2_control.
     """
 
     wire: str
@@ -52,6 +56,8 @@ class EmulatorRequest:
     vanish_after_s: float | None = None
     return_after_s: float | None = None
     servos: ArmFaults = field(default_factory=ArmFaults)
+    joints: JointFaults = field(default_factory=JointFaults)
+    controller: ControllerFaults = field(default_factory=ControllerFaults)
 
 
 class Emulation(Protocol):

@@ -33,14 +33,24 @@ def emulate_arm(file: RobotFile, description: RobotDescription, request: Emulato
     truth = truth_of(space, request)
     noisy = request.profile != "ideal"
     section = section_of(file)
-    device = arm_device(section, description, space, truth, faults=request.servos, noisy=noisy)
+    device = arm_device(
+        section,
+        description,
+        space,
+        truth,
+        faults=request.servos,
+        noisy=noisy,
+        joint_faults=request.joints,
+    )
     return on_pseudo_terminal(device, request, truth.to_json())
 
 
 def emulate_so101(request: EmulatorRequest) -> Emulation:
     """Return an emulated SO-101 behind a pseudo-terminal; its servos keep LeRobot's calibration."""
     truth = truth_of(emulated_space(), request)
-    device = so101_device(truth, faults=request.servos, noisy=request.profile != "ideal")
+    device = so101_device(
+        truth, faults=request.servos, noisy=request.profile != "ideal", joint_faults=request.joints
+    )
     return on_pseudo_terminal(device, request, truth.to_json())
 
 

@@ -43,7 +43,15 @@ def emulate_ros2(file: RobotFile, description: RobotDescription, request: Emulat
 
     section, truth = _section(file), truth_of(default_space(description), request)
     noisy = request.profile != "ideal"
-    device = ros2_device(section, description, truth, noisy=noisy, rates=request.rates)
+    device = ros2_device(
+        section,
+        description,
+        truth,
+        noisy=noisy,
+        rates=request.rates,
+        joint_faults=request.joints,
+        faults=request.controller,
+    )
     return emulation(
         section,
         device,

@@ -10,10 +10,14 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.description import RobotDescription
+from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.messages import (
+    ACTIVE,
+    INACTIVE,
     JointStates,
     decode_point,
     decode_positions,
+    encode_activity,
     encode_joint_states,
 )
 from deal_hw.drivers.ros2.topics import topics_of
@@ -25,6 +29,7 @@ from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.sim.robots.simulated import SimulatedTruth
 from deal_hw.testing.faults import FaultRates, FrameFaults
+from deal_hw.testing.joint_faults import FaultyJoints, JointFaults
 from deal_hw.types import FloatArray
 
 EPOCH_NS: Final = 1_700_000_000_000_000_000
@@ -63,6 +68,8 @@ class Ros2Device:
         truth: Hidden values.
         noisy: Whether positions have the noise of the robot's description.
         rates: Faults of the joint states on the wire.
+        joint_faults: Faults of the joints.
+        faults: Faults of the controller.
     """
 
     def __init__(
@@ -74,7 +81,12 @@ class Ros2Device:
         *,
         noisy: bool = True,
         rates: FaultRates | None = None,
+        joint_faults: JointFaults | None = None,
+        faults: ControllerFaults | None = None,
     ) -> None:
+        self._controller_faults = faults or ControllerFaults()
+        self._told_active: bool | None = None
+        self._first_ns: int | None = None
         d: RobotDescription = robot.description
         self.active, self.host_origin_ns = True, 0
         self.changes: list[tuple[int, int, str]] = []
@@ -93,7 +105,8 @@ class Ros2Device:
         self._step_of_sensor = d.sensor.resolution
         self._batch = ServoBatch(robot, space, 1, threads=1)
         self._batch.set_parameters(np.array([[truth.parameters[name] for name in space.names]]))
-        self._batch.set_sent(np.array(d.stiffness), np.array(d.damping), np.array(d.effort_limit))
+        self._joint_faults = FaultyJoints(joint_faults or JointFaults(), d.joint_names, d.actuated_index)
+        self._drive(limp=False)
         self._effort = self._batch.batch.bind("qfrc_actuator")
         self._dofs = list(robot.qvel)
         self._rng = np.random.default_rng((truth.seed, 3))
@@ -138,6 +151,8 @@ class Ros2Device:
         self.accepted += 1
         if self.accepted == 1:
             self._note("first command", stamp_ns)
+            self._first_ns = self.device_ns
+            self._joint_faults.begin(self.device_ns)
         due = math.ceil((self.device_ns + self._latency_ns) / self._tick_ns - 1e-6)
         # The controller reads commands at the manager's updates.
         due = -(-due // self._stride) * self._stride
@@ -153,16 +168,48 @@ class Ros2Device:
     def tick(self) -> list[tuple[str, bytes]]:
         """Run one tick; return the messages sent in it."""
         out: list[tuple[str, bytes]] = []
+        self._switch()
         if not self._frozen and self._tick % self._stride == 0:
             while self._coming and self._coming[0][0] <= self._tick:
                 _, target, ticks = self._coming.popleft()
                 self._move = _Move(self._setpoint(), target, self._tick, self._tick + ticks)
-            out = self._states()
+            out = [*self._activity(), *self._states()]
+        if (event := self._joint_faults.advance(self.device_ns)) is not None:
+            self._note(event or "sound", 0)
+            self._drive(limp=self._joint_faults.limp)
+        before = self._batch.position.copy()
         self._batch.advance(self._setpoint()[None, None])
+        if self._joint_faults.held:
+            self._batch.set_state(before, np.zeros_like(before))
         self._tick += 1
         if self._freeze_tick is not None and self._tick >= self._freeze_tick:
             self._frozen = True
         return [] if self._is_cut else out
+
+    def _switch(self) -> None:
+        """Deactivate the controller, and activate it again, at the times of its faults."""
+        faults, first_ns = self._controller_faults, self._first_ns
+        if faults.controller_off_after_s is None or first_ns is None:
+            return
+        passed_s = (self.device_ns - first_ns) * 1e-9 - faults.controller_off_after_s
+        active = not 0.0 <= passed_s < faults.controller_off_s
+        if active != self.active:
+            self.active = active
+            self._note("controller active" if active else "controller off", 0)
+        if active and passed_s >= 0.0 and self._section.command == "trajectory":
+            self._controller_faults = ControllerFaults(silent_manager=faults.silent_manager)
+            # A joint trajectory controller holds the pose in which it is activated.
+            at = self._batch.position[0][self._actuated].copy()
+            self._move = _Move(at, at, 0, 0)
+
+    def _activity(self) -> list[tuple[str, bytes]]:
+        """Return the controller_manager's message where a controller's state changed."""
+        if self._controller_faults.silent_manager or self.active == self._told_active:
+            return []
+        self._told_active = self.active
+        name = self._section.controller.strip("/").rpartition("/")[2]
+        states = {"joint_state_broadcaster": ACTIVE, name: ACTIVE if self.active else INACTIVE}
+        return [(self._topics.activity, encode_activity(EPOCH_NS + self.device_ns, states))]
 
     def cut(self, seconds: float) -> None:
         """Let nothing pass in either direction for a while [s]."""
@@ -190,6 +237,13 @@ class Ros2Device:
     @property
     def _is_cut(self) -> bool:
         return self._tick < self._cut_end
+
+    def _drive(self, *, limp: bool) -> None:
+        """Give the drives the description's gains, or none."""
+        d, share = self._description, 0.0 if limp else 1.0
+        self._batch.set_sent(
+            share * np.array(d.stiffness), share * np.array(d.damping), np.array(d.effort_limit)
+        )
 
     def _note(self, event: str, stamp_ns: int) -> None:
         stamp_ns = stamp_ns or self.host_origin_ns + self.device_ns
@@ -222,12 +276,13 @@ class Ros2Device:
 
     def _states(self) -> list[tuple[str, bytes]]:
         position = reported(self._batch.position[0], self._noise, self._step_of_sensor, self._rng)
+        position, velocity = self._joint_faults.read(position, self._batch.velocity[0])
         payload = encode_joint_states(
             JointStates(
                 stamp_ns=EPOCH_NS + self.device_ns,
                 names=self._names,
                 position=position[self._order],
-                velocity=self._batch.velocity[0][self._order],
+                velocity=velocity[self._order],
                 effort=self._effort[0, self._dofs][self._order],
             )
         )

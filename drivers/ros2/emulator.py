@@ -9,12 +9,14 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.ros2.connect import make_link
 from deal_hw.drivers.ros2.device import Ros2Device
+from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.topics import topics_of
 from deal_hw.drivers.transports.topic_emulator import TopicEmulator
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.robots.ros2_section import Ros2Section
 from deal_hw.sim.robots.simulated import SimulatedTruth, default_space
 from deal_hw.testing.faults import FaultRates
+from deal_hw.testing.joint_faults import JointFaults
 from deal_hw.transport import TopicTransport
 
 PORTS: Final = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
@@ -28,6 +30,8 @@ def ros2_device(
     *,
     noisy: bool = True,
     rates: FaultRates | None = None,
+    joint_faults: JointFaults | None = None,
+    faults: ControllerFaults | None = None,
 ) -> Ros2Device:
     """Return an emulated robot.
 
@@ -37,9 +41,20 @@ def ros2_device(
         truth: Hidden parameters.
         noisy: Whether positions have the noise of the description.
         rates: Faults of the joint states on the wire.
+        joint_faults: Faults of the joints.
+        faults: Faults of the controller.
     """
     robot, space = load_model(description), default_space(description)
-    return Ros2Device(section, robot, space, truth, noisy=noisy, rates=rates)
+    return Ros2Device(
+        section,
+        robot,
+        space,
+        truth,
+        noisy=noisy,
+        rates=rates,
+        joint_faults=joint_faults,
+        faults=faults,
+    )
 
 
 class Ros2Emulation(TopicEmulator):
@@ -65,7 +80,7 @@ class Ros2Emulation(TopicEmulator):
         freeze_after_s: float | None = None,
     ) -> None:
         topics = topics_of(section)
-        super().__init__(device, transport, [topics.states], [topics.commands])
+        super().__init__(device, transport, [topics.states, topics.activity], [topics.commands])
         self._robot, self._cut_s = device, cut_s
         self._cut_after_s, self._freeze_after_s = cut_after_s, freeze_after_s
         self._begun_ns: int | None = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from deal_hw.drivers.ros2.messages import HASHES, STATE_TYPE
+from deal_hw.drivers.ros2.messages import HASHES, STATE_NAMES, STATE_TYPE
 from deal_hw.drivers.ros2.topics import RobotTopics, ros_topic
 from deal_hw.errors import ProtocolError, VersionMismatchError, WrongDeviceError
 from deal_hw.sim.robots.ros2_section import Ros2Section
@@ -58,7 +58,7 @@ class Graph:
 
     def no_controller(self) -> str:
         """Return the message about commands that nobody reads."""
-        name = self._section.controller.strip("/").rpartition("/")[2]
+        name = self.controller
         manager = f" -c /{self._section.topic('controller_manager')}" if self._section.namespace else ""
         return (
             f"nobody subscribes to {ros_topic(self._topics.commands)}: controller {name} is not loaded, or "
@@ -67,12 +67,25 @@ class Graph:
             "starts it"
         )
 
+    @property
+    def controller(self) -> str:
+        """The controller's name, as the controller_manager says it."""
+        return self._section.controller.strip("/").rpartition("/")[2]
+
+    def not_active(self, state: int) -> str:
+        """Return the message about a controller that the controller_manager reports in another state."""
+        name = STATE_NAMES.get(state, f"in state {state}")
+        return (
+            f"the controller_manager says that {self.controller} is {name}: it takes no commands. Find out "
+            "why (emergency stop, a fault of the hardware, another program), then "
+            f"`ros2 control switch_controllers --activate {self.controller}`"
+        )
+
     def inactive(self) -> str:
         """Return the remedy if the robot does not follow commands that its controller gets."""
-        name = self._section.controller.strip("/").rpartition("/")[2]
         return (
-            f"Is the controller active (`ros2 control switch_controllers --activate {name}`), the emergency "
-            "stop released, the drive enabled?"
+            f"Is the controller active (`ros2 control switch_controllers --activate {self.controller}`), the "
+            "emergency stop released, the drive enabled?"
         )
 
     def state_publishers(self) -> Iterator[str]:

@@ -29,6 +29,7 @@ def dds_name(kind: RosMessageType) -> str:
 
 
 STATE_TYPE: Final = dds_name(JOINT_STATE)
+ACTIVITY_TYPE: Final = "controller_manager_msgs::msg::dds_::ControllerManagerActivity_"
 COMMAND_TYPES: Final[Mapping[str, str]] = MappingProxyType(
     {"position": dds_name(FLOAT64_MULTI_ARRAY), "trajectory": dds_name(JOINT_TRAJECTORY)}
 )
@@ -40,6 +41,7 @@ HASHES: Final[Mapping[str, str]] = MappingProxyType(
             "RIHS01_1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"
         ),
         dds_name(JOINT_TRAJECTORY): "RIHS01_179b33eba59d676f6d967ac71fe35e7ca2f64b2f3928f4a018cec115e213796e",
+        ACTIVITY_TYPE: "RIHS01_35b7de5d611b6780e89732de325f2f765eacdb8a7adfe5821a27af4a03a7c244",
     }
 )
 """DDS name of a type -> its hash since ROS 2 Iron (REP 2016); Humble has none."""
@@ -146,13 +148,57 @@ def decode_point(payload: bytes) -> TrajectoryPoint:
     return TrajectoryPoint(names, position, (sec * _SECOND + nanosec) / _SECOND)
 
 
-def _decoded(kind: RosMessageType, payload: bytes) -> tuple[Any, ...]:
+INACTIVE, ACTIVE = 2, 3
+"""States of a controller (``lifecycle_msgs/State``)."""
+STATE_NAMES: Final = {0: "unknown", 1: "unconfigured", INACTIVE: "inactive", ACTIVE: "active", 4: "finalized"}
+_MOST_ENTRIES: Final = 1000
+_ACTIVITY: Final = "controller_manager_msgs/msg/ControllerManagerActivity"
+_STAMPED: Final = (("int32", "sec"), ("uint32", "nanosec"), ("string", "frame_id"))
+
+
+def _activity_type(*counts: int) -> RosMessageType:
+    """Return the layout of an activity with so many controllers, and so many hardware components."""
+    fields = list(_STAMPED)
+    for part, count in zip(("controllers", "hardware_components"), counts, strict=False):
+        fields.append(("uint32", part))
+        for k in range(count):
+            fields += [("string", f"{part}[{k}].name"), ("uint8", f"{part}[{k}].id")]
+            fields.append(("string", f"{part}[{k}].label"))
+    return RosMessageType(_ACTIVITY, (*fields, *((("uint32", "more"),) if len(counts) < 2 else ())))
+
+
+def encode_activity(stamp_ns: int, controllers: Mapping[str, int]) -> bytes:
+    """Return a ``ControllerManagerActivity`` without hardware components, as CDR with header.
+
+    Args:
+        stamp_ns: Stamp of its header [ns].
+        controllers: Name of a controller -> its state.
+    """
+    entries = (value for name, state in controllers.items() for value in (name, state, STATE_NAMES[state]))
+    kind = _activity_type(len(controllers), 0)
+    return kind.encode(*divmod(stamp_ns, _SECOND), "", len(controllers), *entries, 0)
+
+
+def decode_activity(payload: bytes) -> dict[str, int]:
+    """Return the states of the controllers in a ``ControllerManagerActivity``, by name.
+
+    Raises:
+        FrameError: It is no such message.
+    """
+    count = int(_decoded(_activity_type(), payload, whole=False)[-1])
+    if count > _MOST_ENTRIES:
+        raise FrameError(f"{_ACTIVITY}: {count} controllers")
+    _, _, _, _, *values = _decoded(_activity_type(count), payload, whole=False)
+    return dict(zip(values[0:-1:3], map(int, values[1:-1:3]), strict=True))
+
+
+def _decoded(kind: RosMessageType, payload: bytes, *, whole: bool = True) -> tuple[Any, ...]:
     if payload[:2] != _LITTLE:
         raise FrameError(
             f"{kind.name}: it begins with {payload[:4].hex(' ')!r}, expected {_LITTLE.hex(' ')} (plain CDR, "
             "little-endian)"
         )
     try:
-        return kind.decode(_HEADER + payload[4:], whole=True)
+        return kind.decode(_HEADER + payload[4:], whole=whole)
     except ProtocolError as error:
         raise FrameError(str(error)) from error

@@ -12,13 +12,20 @@ from deal_hw.clock import Clock
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.command_echo import CommandEcho
 from deal_hw.drivers.ros2.graph import Graph
-from deal_hw.drivers.ros2.messages import TrajectoryPoint, encode_point, encode_positions
+from deal_hw.drivers.ros2.messages import (
+    ACTIVE,
+    TrajectoryPoint,
+    decode_activity,
+    encode_point,
+    encode_positions,
+)
 from deal_hw.drivers.ros2.start_motion import StartMotion
 from deal_hw.drivers.ros2.state_stream import JointSample, JointStateStream
 from deal_hw.drivers.ros2.topics import ros_topic, topics_of
 from deal_hw.drivers.topic_robot import TopicRobot
 from deal_hw.errors import (
     ConfigurationError,
+    FrameError,
     SafetyError,
     TransportTimeoutError,
     VersionMismatchError,
@@ -46,6 +53,8 @@ _PASSIVE_DELAY_NS: Final = 20_000_000
 """States that arrive within this time after the hold command do not confirm it [ns]."""
 _FRESH_NS: Final = 200_000_000
 """An older state is no pose to hold [ns]."""
+_ASTRAY: Final = {"rad": 0.3, "m": 0.06}
+"""A joint that is further from the held pose was moved: the pose is measured again [rad or m]."""
 _STILL: Final = {"rad": 0.15, "m": 0.03}
 """A joint slower than this stands [rad/s or m/s]."""
 
@@ -103,7 +112,9 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         self._order = [description.actuated.index(joint) for joint in section.joints or description.actuated]
         self._ros_names = tuple(section.ros_name(description.actuated[a]) for a in self._order)
         self._period_s = 1.0 / description.control_rate_hz
-        self._still = np.array([_STILL[description.position_units[j]] for j in self._actuated])
+        units = [description.position_units[j] for j in self._actuated]
+        self._still = np.array([_STILL[unit] for unit in units])
+        self._astray = np.array([_ASTRAY[unit] for unit in units])
         self._echo = CommandEcho()
         self._forget()
 
@@ -126,6 +137,7 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         self._foreign_ns: int | None = None
         self._watched_ns = 0
         self._fault = ""
+        self._controller_state = ACTIVE
 
     # Connection.
 
@@ -134,7 +146,8 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         if self.info is not None:
             return
         self._transport.declare(
-            publish=[self._topics.commands], subscribe=[self._topics.states, self._topics.commands]
+            publish=[self._topics.commands],
+            subscribe=[self._topics.states, self._topics.commands, self._topics.activity],
         )
         self._transport.open()
         try:
@@ -242,6 +255,8 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
             raise SafetyError(f"{self.description.name}: {self._graph.foreign_complaint(who)}")
         if self._graph.controlled is False:
             raise SafetyError(f"{self.description.name}: {self._graph.no_controller()}")
+        if self._controller_state != ACTIVE:
+            raise SafetyError(f"{self.description.name}: {self._graph.not_active(self._controller_state)}")
 
     # The start pose, and commands.
 
@@ -332,6 +347,9 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
     def passive(self) -> None:
         """Hold the joints where they were measured; the pose stays until the robot is homed or armed again.
 
+        So an arm does not sag step by step. A joint that was moved away, while its drive was off, is not
+        brought back: there the pose is measured anew.
+
         States received before are dropped. Nothing is sent by a run that never commanded the robot, nor while
         another program commands it: two would fight.
 
@@ -346,11 +364,17 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         if self._in_charge and not self._in_force:
             return
         now_ns = self._clock.now_ns()
-        if self._hold is None:
+        if self._hold is None or self._is_astray(now_ns):
             self._hold = self._pose_to_hold(now_ns)
         if self._passive_ns is None or not self._is_contested(now_ns):
             self._publish(self._hold)
         self._passive_ns = now_ns
+
+    def _is_astray(self, now_ns: int) -> bool:
+        state = self._newest
+        if state is None or self._hold is None or now_ns - state.receive_ns > _FRESH_NS:
+            return False
+        return bool((np.abs(state.position[self._actuated] - self._hold) > self._astray).any())
 
     def _pose_to_hold(self, now_ns: int) -> FloatArray:
         state = self._newest
@@ -414,12 +438,25 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
             self._foreign_ns = message.stamp_ns
             if self._armed or self._homing:
                 self._latch(self._graph.foreign_complaint(self._graph.foreign()))
+        elif message.channel == self._topics.activity:
+            self._take_activity(message.payload)
         elif (sample := self._stream.take(message)) is not None:
             self._take(sample, message.stamp_ns)
         if self._armed:
             if self._stream.trouble:
                 self._latch(self._stream.trouble)
             self._watch(message.stamp_ns)
+
+    def _take_activity(self, payload: bytes) -> None:
+        """Note whether the controller is active; older controller_managers say nothing of it."""
+        try:
+            states = decode_activity(payload)
+        except FrameError:
+            self._stream.errors += 1
+            return
+        self._controller_state = states.get(self._graph.controller, self._controller_state)
+        if self._controller_state != ACTIVE and (self._armed or self._homing):
+            self._latch(self._graph.not_active(self._controller_state))
 
     def _watch(self, now_ns: int) -> None:
         """Look now and then whether another program began to publish commands, or the controller left."""

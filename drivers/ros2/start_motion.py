@@ -8,8 +8,10 @@ from typing import Final
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.control.safety.following import FollowingWatch
 from deal_hw.description import RobotDescription
 from deal_hw.errors import SafetyError, TransportTimeoutError
+from deal_hw.motions.behaviours import position_command
 from deal_hw.types import FloatArray, RobotState
 
 _SPEED: Final = {"rad": 0.5, "m": 0.1}
@@ -18,8 +20,6 @@ _NUDGE: Final = {"rad": 0.05, "m": 0.01}
 """How far a joint is moved to see that it follows [rad or m]; twice that if it does not."""
 _FOLLOWS: Final = 0.4
 """Share of a nudge that a joint moves at least; friction and a weak gain keep it from the rest."""
-_ASTRAY: Final = {"rad": 0.3, "m": 0.06}
-"""A joint that is further from its target has not followed [rad or m]."""
 _ARRIVED: Final = {"rad": 0.2, "m": 0.03}
 """A joint that stands this close to the start pose has arrived [rad or m]; a load bends it."""
 _STILL: Final = {"rad": 0.1, "m": 0.02}
@@ -59,6 +59,7 @@ class StartMotion:
         limit = np.array(description.limits.trip_velocity)[self._index]
         self._speed = np.minimum(self._of(_SPEED), 0.5 * limit)
         self._target = self._reached = np.zeros(len(self._index))
+        self._watch = FollowingWatch(description)
 
     def run(self, end_ns: int) -> None:
         """Hold, nudge, move; the clock's time limit is ``end_ns`` [ns].
@@ -130,18 +131,17 @@ class StartMotion:
             self._step(begin + (goal - begin) * step / steps)
 
     def _step(self, target: FloatArray) -> RobotState:
-        """Publish a target, wait one control period, and check that the joints are near it."""
+        """Publish a target, wait one control period, and check that the joints follow."""
         due_ns = self._clock.now_ns() + self._period_ns
         self._publish(target)
         self._target = target
         state = self._wait(due_ns)
-        off = np.abs(self._measured(state) - target) - self._of(_ASTRAY)
-        if off.max() > 0:
-            a = int(off.argmax())
+        command, velocity = position_command(self._d, target), state.velocity[self._index]
+        lost = self._watch.step(state.receive_ns, self._measured(state), velocity, command)
+        if lost is not None:
             raise SafetyError(
-                f"{self._d.name}: joint {self._d.actuated[a]} is at {self._measured(state)[a]:.2f} "
-                f"{self._units[a]}, but its target is {target[a]:.2f}. Something blocks it, or `joints` in "
-                f"robot.yaml is not in the controller's order. {self._remedy}"
+                f"{self._d.name}: {lost.reason}. Is `joints` in robot.yaml in the controller's order? "
+                f"{self._remedy}"
             )
         return state
 

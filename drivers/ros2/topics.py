@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-from deal_hw.drivers.ros2.messages import COMMAND_TYPES, HASHES, STATE_TYPE
+from deal_hw.drivers.ros2.messages import ACTIVITY_TYPE, COMMAND_TYPES, HASHES, STATE_TYPE
 from deal_hw.drivers.transports.topics import TypedTopics
 from deal_hw.sim.robots.ros2_section import Ros2Section
 
@@ -19,6 +19,8 @@ _HEADER: Final = "std_msgs::msg::dds_::Header_"
 _DIMENSION: Final = "std_msgs::msg::dds_::MultiArrayDimension_"
 _LAYOUT: Final = "std_msgs::msg::dds_::MultiArrayLayout_"
 _POINT: Final = "trajectory_msgs::msg::dds_::JointTrajectoryPoint_"
+_LIFECYCLE: Final = "lifecycle_msgs::msg::dds_::State_"
+_NAMED: Final = "controller_manager_msgs::msg::dds_::NamedLifecycleState_"
 _FLOATS: Final = "sequence<float64>"
 STRUCTS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -42,6 +44,13 @@ STRUCTS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "joint_names": "sequence<string>",
             "points": f"sequence<{_POINT}>",
         },
+        _LIFECYCLE: {"id": "octet", "label": "string"},
+        _NAMED: {"name": "string", "state": _LIFECYCLE},
+        ACTIVITY_TYPE: {
+            "header": _HEADER,
+            "controllers": f"sequence<{_NAMED}>",
+            "hardware_components": f"sequence<{_NAMED}>",
+        },
     }
 )
 """Struct -> field -> type, named as in IDL; a struct comes after those that it contains."""
@@ -49,22 +58,28 @@ STRUCTS: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotTopics:
-    """The two topics of a robot, as on the wire of DDS.
+    """The topics of a robot, as on the wire of DDS.
 
     Attributes:
         states: Of its joint states.
         commands: Of its controller's commands.
         command_type: DDS name of the commands' type.
+        activity: Of the controller_manager's word on its controllers, since ROS 2 Jazzy.
     """
 
     states: str
     commands: str
     command_type: str
+    activity: str
 
     @property
     def typed(self) -> TypedTopics:
         """The same for a transport."""
-        types = {self.states: STATE_TYPE, self.commands: self.command_type}
+        types = {
+            self.states: STATE_TYPE,
+            self.commands: self.command_type,
+            self.activity: ACTIVITY_TYPE,
+        }
         return TypedTopics(types=types, structs=STRUCTS, hashes=HASHES)
 
 
@@ -74,6 +89,7 @@ def topics_of(section: Ros2Section) -> RobotTopics:
         states=PREFIX + section.state_topic,
         commands=PREFIX + section.command_topic,
         command_type=COMMAND_TYPES[section.command],
+        activity=PREFIX + section.topic("controller_manager/activity"),
     )
 
 

@@ -8,6 +8,7 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 
 from deal_hw.clock import Clock
+from deal_hw.control.safety.following import FollowingWatch
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.servo_arm.absence import AbsenceWatch
 from deal_hw.drivers.servo_arm.commands import CommandCodec, Registers, clipped
@@ -17,6 +18,7 @@ from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, ServoBus, SilentS
 from deal_hw.drivers.servo_bus.polled_robot import PolledRobot, status_of
 from deal_hw.drivers.servo_bus.samples import SampleGrid
 from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
+from deal_hw.motions.behaviours import position_command
 from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
 from deal_hw.transport import Transport
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
@@ -220,20 +222,31 @@ class ServoArm(PolledRobot[ServoBus]):
                 )
 
     def _move(self, start: FloatArray, end: FloatArray, end_ns: int) -> None:
-        """Move the joints on straight lines to a pose, and wait until they are near and still."""
+        """Move the joints on straight lines to a pose, and wait until they are near and still.
+
+        Raises:
+            SafetyError: A joint does not follow, or a servo reports an error.
+            TransportTimeoutError: The arm did not arrive in time.
+        """
+        watch, index = FollowingWatch(self.description), list(self.description.actuated_index)
         fastest = min(_HOMING_RAD_S, *(0.5 * v for v in self.description.limits.trip_velocity))
         steps = max(round(np.abs(end - start).max() / fastest * self.description.state_rate_hz), 1)
         step = 0
         while True:
             step = min(step + 1, steps)
-            self._bus.post(self._family.goals(self._codec.goals(start + (end - start) * step / steps)))
+            target = start + (end - start) * step / steps
+            self._bus.post(self._family.goals(self._codec.goals(target)))
             samples = self._samples(self._clock.now_ns() + _PATIENCE_NS)
             self._judge(samples)
             if self._fault:
                 raise SafetyError(self._fault)
-            off = np.abs(self._codec.positions(samples) - end)
-            speed = np.abs(self._codec.velocities(samples)).max()
-            if step == steps and off.max() < _ARRIVED_RAD and speed < _SETTLED_RAD_S:
+            position, velocity = self._codec.positions(samples), self._codec.velocities(samples)
+            command = position_command(self.description, target[index])
+            lost = watch.step(self._clock.now_ns(), position[index], velocity[index], command)
+            if lost is not None:
+                raise SafetyError(f"{self.description.name}: {lost.reason}")
+            off = np.abs(position - end)
+            if step == steps and off.max() < _ARRIVED_RAD and np.abs(velocity).max() < _SETTLED_RAD_S:
                 return
             if self._clock.now_ns() >= end_ns:
                 worst = int(off.argmax())

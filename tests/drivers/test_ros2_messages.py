@@ -174,6 +174,6 @@ def test_a_layout_and_several_points_are_refused() -> None:
 
 
 def test_hashes_have_the_form_of_rep_2016() -> None:
-    """One of each of the three types; 64 hexadecimal digits."""
-    assert len(HASHES) == 3
+    """One of each of the four types; 64 hexadecimal digits."""
+    assert len(HASHES) == 4
     assert all(text.startswith("RIHS01_") and len(bytes.fromhex(text[7:])) == 32 for text in HASHES.values())

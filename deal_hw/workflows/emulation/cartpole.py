@@ -91,4 +91,5 @@ def _hazards(config: EmulateCartpoleSettings) -> Hazards:
         else None,
         can=config.can,
         servo=config.servo,
+        joints=config.joints,
     )

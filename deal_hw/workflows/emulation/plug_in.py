@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.robots import robot_entry
 from deal_hw.robots.connect import reached_over
@@ -58,5 +59,7 @@ def request_of(config: EmulatePlugInSettings, wire: str) -> EmulatorRequest:
         link=None if config.link is None else Path(config.link),
         vanish_after_s=config.vanish_after_s,
         return_after_s=config.return_after_s,
+        joints=config.joints,
         servos=config.servos if isinstance(config, EmulateArmSettings) else ArmFaults(),
+        controller=config.controller if isinstance(config, EmulateArmSettings) else ControllerFaults(),
     )

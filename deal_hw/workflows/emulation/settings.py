@@ -11,12 +11,14 @@ from deal_hw.drivers.cartpole.emulator.faults import CanFaults, ServoFaults
 from deal_hw.drivers.g1.emulator.faults import G1Faults
 from deal_hw.drivers.go2.emulator.faults import Go2Faults
 from deal_hw.drivers.h1.faults import H1Faults
+from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.drivers.unitree.hung_faults import HungFaults
 from deal_hw.errors import ConfigurationError
 from deal_hw.ranges import Checked, Range, check_ranges
 from deal_hw.robots import driven_entry, emulated_robots, has_hardware, robot_entry
 from deal_hw.robots.file_robot import has_servos, robot_yaml
+from deal_hw.testing.joint_faults import JointFaults
 from deal_hw.transport import NetworkOptions, WireOptions
 from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
 from deal_hw.workflows.options import File, Ratio, Seed, Share, given, refuse
@@ -143,6 +145,9 @@ class EmulateSettings(Checked):
     cut_s: Annotated[float, Range(0, 1e7, "s")] = 1.0
     """How long the wire is cut [s]."""
 
+    joints: JointFaults = field(default_factory=JointFaults)
+    """Faults of its joints."""
+
     events_to: File | None = None
     """Append each received command to this file at once: lines of JSON with device time [ms], host time [ns]
     and the command."""
@@ -246,10 +251,18 @@ class EmulateArmSettings(EmulatePlugInSettings):
     servos: ArmFaults = field(default_factory=ArmFaults)
     """Faults of its servos."""
 
+    controller: ControllerFaults = field(default_factory=ControllerFaults)
+    """Faults of its controller."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if is_user_robot(self.robot) and not has_servos(self.robot):
             refuse(given(self.servos, ArmFaults()), "only a robot whose `hardware` has a bus has servos")
+        if not is_user_robot(self.robot) or has_servos(self.robot):
+            refuse(
+                given(self.controller, ControllerFaults()),
+                "only a robot whose `hardware` is ros2_control has such a controller",
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,7 +98,7 @@ def emulate_on_topics(
 
 def of_every_robot(config: EmulateSettings) -> dict[str, Any]:
     """Return the faults that every emulated robot has, as its plan names them."""
-    names = ("drop", "duplicate", "corrupt", "freeze_after_s", "cut_after_s", "cut_s")
+    names = ("drop", "duplicate", "corrupt", "freeze_after_s", "cut_after_s", "cut_s", "joints")
     return {name: getattr(config, name) for name in names}
 
 
