@@ -61,6 +61,8 @@ DESCRIPTION: Final = RobotDescription(
         state_age_s=0.1,
         action_age_s=0.04,
         ease_in_s=1.0,
+        # It closes on objects with its whole torque.
+        may_be_blocked=("gripper",),
     ),
     sensor=SensorModel(noise=(0.5e-3,) * 6, resolution=(TICK_RAD,) * 6, velocity_window_s=0.04),
     mjcf=Path(__file__).parent / "assets" / "so101.xml",

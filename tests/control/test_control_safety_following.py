@@ -500,3 +500,29 @@ def test_the_safety_module_watches_only_what_it_sends() -> None:
     now_ns = 10**10 + 20 * MS
     decision = safety.step(CycleInput(now_ns=now_ns, state=state(now_ns, bad)), command(1.0, 1.0))
     assert decision.flags == ("state_not_finite",)
+
+
+def test_a_joint_that_is_pushed_to_both_sides_and_stands_is_found_at_once() -> None:
+    """Half of the limit to one side and to the other, smoothed over 0.1 s: no load explains both.
+
+    0.3 s of 60 % are 57 % when smoothed. Then -60 % lead to -50 % after 0.1 s * ln(1.17 / 0.1) = 0.25 s.
+    """
+    watch = FollowingWatch(robot())
+
+    def target(time_s: float) -> tuple[float, float]:
+        return (0.12 if time_s <= 0.3 else -0.12) if time_s > 0 else 0.0, 0.0
+
+    found = play(watch, target, still(0.0, 0.0))
+    assert found is not None and found[0] == pytest.approx(0.55, abs=0.021)
+    assert watch.worst < 0.3
+
+
+def test_a_joint_that_moves_a_little_between_two_pushes_follows() -> None:
+    """6 mrad are more than a reading's noise."""
+    creep: Motion = lambda t: (0.006 * round(2 * t), 0.0)  # noqa: E731
+
+    def target(time_s: float) -> tuple[float, float]:
+        return creep(time_s)[0] + (0.11 if time_s % 1.0 < 0.5 else -0.11), 0.0
+
+    found = play(FollowingWatch(robot(limits={"may_be_blocked": ("a", "b")})), target, creep)
+    assert found is None

@@ -5,11 +5,12 @@ away from its set-point says how hard the drive pushes, if it is on and reads th
 harder than its usual load asks for must move that way, or gain speed that way. One that does not is blocked,
 or its drive is off, or the reading is not that of this joint.
 
-What counts is the push over time. At the drive's limit it is noticed after 0.36 s, at a third of the limit
-after 1 s, at the least push after 2 s. A leg that never reaches its set-point under load follows: its load is
-usual. A joint that moves at its limit follows, too. Two kinds of wrong readings are found in another way: a
-reading that jumps faster than the joint can move, and readings that fit the set-point of another joint, or
-the own one with the other sign.
+A joint that stands while it is pushed to one side and then to the other is found at once. Else what counts is
+the push over time. At the drive's limit it is noticed after 0.36 s, at a third of the limit after 1 s, at the
+least push after 2 s. A leg that never reaches its set-point under load follows: its load is usual. A joint
+that moves at its limit follows, too. Two kinds of wrong readings are found in another way: a reading that
+jumps faster than the joint can move, and readings that fit the set-point of another joint, or the own one
+with the other sign.
 
 Pure: no I/O, and time is an argument.
 """
@@ -31,8 +32,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 PUSH_S: Final = 0.3
 """A push at the drive's limit without motion for this long, or a smaller one for longer, is no following [s].
-tools/measure_following.py has what shipped motions reach. On recordings of a real SO-101 it is at most 0.09
-with the description's stiffness, and 0.3 with 1.6 times as much (isaac-sim2real/sage, eight motions)."""
+tools/measure_following.py has what shipped motions reach. On eight recordings of a real SO-101 (isaac-sim2real/
+sage) it is at most 0.12; where its fingertip presses on a table 0.29, and with 1.6 times the stiffness more."""
 LEAST_PUSH: Final = 0.15
 """A smaller share of the drive's limit beyond the usual load does not count: friction, or a new load."""
 LOAD_S: Final = 1.0
@@ -41,6 +42,10 @@ DEAD_S: Final = 0.06
 """A push counts after this time in one direction [s]: a command takes some 10 to 40 ms to act."""
 FORGET: Final = 0.02
 """Without a push, the counted one falls by this much a second."""
+SWING: Final = 0.5
+"""A push that rises by this share of the limit, and falls by it, moves every joint, whatever its load."""
+STUCK: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.005, "m": 0.001})
+"""A joint that moves by less stands [rad or m]; a reading's noise is 1 to 2 mrad."""
 LEAST_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.2, "m": 0.04})
 """No drive reaches its limit at a smaller error: a model's stiffness is often far above the real one."""
 UNKNOWN_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.5, "m": 0.1})
@@ -52,7 +57,7 @@ JUMP: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.05, "m": 0.01})
 JUMP_SPEEDS: Final = 2.0
 """A reading that changes by more than this, plus this many times the trip speed, has jumped [rad or m]."""
 ELSEWHERE: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.12, "m": 0.024})
-FITS: Final = 0.15
+FITS: Final = 0.2
 """A reading that is so far from its own set-point, and at most this share of it from another one, is not the
 joint's own; both are means over some tenths of a second, of slow motion [rad or m]."""
 SLOW_S: Final = 0.1
@@ -103,6 +108,7 @@ class FollowingWatch:
         self._limit = np.where(self._limited, limit, 0.0)
         self._most = np.where(self._limited, limit, 1.0)
         self._reach = np.where(self._limited, by_unit(LEAST_REACH), by_unit(UNKNOWN_REACH))
+        self._stands = by_unit(STUCK)
         self._moved, self._faster = by_unit(MOVED), by_unit(FASTER)
         self._jump, self._elsewhere = by_unit(JUMP), by_unit(ELSEWHERE)
         self._speed = np.array(d.limits.trip_velocity, dtype=float)[index]
@@ -152,12 +158,15 @@ class FollowingWatch:
         self._setpoint = command.position_target.copy()
         count = len(position)
         self._load = self._share(position, command)
+        self._at = position.copy()
+        self._smooth, self._rest = self._load.copy(), self._load.copy()
+        self._least, self._greatest = self._load.copy(), self._load.copy()
         self._way = np.zeros(count)
         self._way_s, self._counted = np.zeros(count), np.zeros(count)
         self._from, self._from_velocity = position.copy(), velocity.copy()
         self._followed_ns, self._near_ns = np.full(count, now_ns), np.full(count, now_ns)
         self._before, self._odd = position.copy(), np.zeros(count, dtype=bool)
-        self._slow = [position.copy(), position.copy(), self._setpoint.copy(), self._setpoint.copy()]
+        self._slow = [position.copy() for _ in range(2)] + [self._setpoint.copy() for _ in range(3)]
         self._off = np.zeros((count, count))
         self._off_turned = np.zeros(count)
 
@@ -198,10 +207,10 @@ class FollowingWatch:
         self._followed_ns = np.where(doubtful, self._followed_ns, now_ns)
         self._load = self._load + (share - self._load) * min(passed_s / LOAD_S, 1.0)
         self.worst = max(self.worst, float(self._counted.max()))
-        late = self._counted >= PUSH_S
+        late = (self._counted >= PUSH_S) | (self._swung(position, share, passed_s) & ~self._may_be_blocked)
         if not late.any():
             return None
-        worst = int(np.argmax(np.where(late, self._counted, -1.0)))
+        worst = int(np.argmax(np.where(late, np.abs(share), -1.0)))
         off = self._setpoint[worst] - position[worst]
         return self._unfollowed(
             late,
@@ -211,6 +220,18 @@ class FollowingWatch:
             "but the joint does not move that way. It is blocked, its drive is off or limp, or its reading "
             "stands still; look at it before the next run",
         )
+
+    def _swung(self, position: FloatArray, share: FloatArray, passed_s: float) -> BoolArray:
+        """Return which joints stand although they were pushed to both sides, (A,)."""
+        self._smooth = self._smooth + (share - self._smooth) * (1.0 - np.exp(-passed_s / SLOW_S))
+        moved = np.abs(position - self._at) >= self._stands
+        self._at = np.where(moved, position, self._at)
+        self._rest = np.where(moved, self._smooth, self._rest)
+        self._least = np.where(moved, self._smooth, np.minimum(self._least, self._smooth))
+        self._greatest = np.where(moved, self._smooth, np.maximum(self._greatest, self._smooth))
+        rise, fall = self._greatest - self._rest, self._rest - self._least
+        swung: BoolArray = np.minimum(rise, fall) >= SWING
+        return swung
 
     def _jumped(self, position: FloatArray, passed_s: float) -> Unfollowed | None:
         """Find readings that changed faster than a joint can move, and stayed so for a second state."""
@@ -234,15 +255,15 @@ class FollowingWatch:
     ) -> Unfollowed | None:
         """Find readings that fit another joint's set-point, or the own one with the other sign."""
         slow = 1.0 - np.exp(-passed_s / SLOW_S)
-        once, twice, target_once, target_twice = self._slow
-        once = once + slow * (position - once)
-        twice = twice + slow * (once - twice)
-        target_once = target_once + slow * (self._setpoint - target_once)
-        target_twice = target_twice + slow * (target_once - target_twice)
-        self._slow = [once, twice, target_once, target_twice]
+        reading, target = position, self._setpoint
+        for k in range(2):
+            reading = self._slow[k] = self._slow[k] + slow * (reading - self._slow[k])
+        # Once more than the reading, since a joint is some tenths of a second behind its set-point.
+        for k in range(2, 5):
+            target = self._slow[k] = self._slow[k] + slow * (target - self._slow[k])
         mean = 1.0 - np.exp(-passed_s / MEAN_S)
-        self._off += mean * (np.subtract.outer(twice, target_twice) ** 2 - self._off)
-        self._off_turned += mean * ((twice + target_twice) ** 2 - self._off_turned)
+        self._off += mean * (np.subtract.outer(reading, target) ** 2 - self._off)
+        self._off_turned += mean * ((reading + target) ** 2 - self._off_turned)
         near = np.abs(position - self._setpoint) < self._elsewhere
         self._near_ns = np.where(near, now_ns, self._near_ns)
         # A drive that is set to be weak may stay behind.

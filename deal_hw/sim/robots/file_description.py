@@ -59,6 +59,7 @@ def limits_of(file: RobotFile, control_rate_hz: float) -> SafetyLimits:
         state_age_s=age_s,
         action_age_s=age_s,
         ease_in_s=EASE_IN_S if hardware else 0.0,
+        may_be_blocked=tuple(joint.name for joint, _ in driven if joint.may_be_blocked),
     )
 
 

@@ -69,6 +69,8 @@ class JointEntry:
             no limit.
         sensor_noise: Standard deviation of a reported position [rad or m].
         sensor_resolution: Step of a reported position [rad or m]; 0 for none.
+        may_be_blocked: Whether it may push at its limit without moving, as a gripper does that holds an
+            object. Any other joint that does trips a run.
         actuator: None for a joint without an actuator.
     """
 
@@ -81,6 +83,7 @@ class JointEntry:
     velocity_limit: float | None = None
     sensor_noise: float = 0.0
     sensor_resolution: float = 0.0
+    may_be_blocked: bool = False
     actuator: ActuatorEntry | None = None
 
     def __post_init__(self) -> None:
@@ -269,6 +272,8 @@ def _joint_lines(joint: JointEntry) -> list[str]:
         ("sensor_noise", joint.sensor_noise, f"[{unit}]"),
         ("sensor_resolution", joint.sensor_resolution, f"[{unit}]"),
     ]
+    if joint.may_be_blocked:
+        fields.append(("may_be_blocked", True, "such as a gripper that holds an object"))
     lines = [_line("- name", joint.name, "as in the MJCF", indent=2)]
     lines += [_line(name, value, comment, indent=4) for name, value, comment in fields]
     if joint.actuator is None:
