@@ -18,6 +18,10 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+NOT_FOLLOWING = "not following"
+"""Kind of the :class:`Event` that joints do not follow their commands, until the recording's end. Its data:
+``since_ns``, the host clock from which on they do not [ns], and ``joints``, their names."""
+
 
 class Status(enum.IntFlag):
     """Status of a robot; each driver maps its own bits onto these."""

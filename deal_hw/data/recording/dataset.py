@@ -7,7 +7,8 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +17,7 @@ from typing import Any, ClassVar
 from typing_extensions import Self
 
 from deal_hw.data.files import INDEX_NAME, write_bytes, write_json
-from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
+from deal_hw.data.recording.episode_info import EpisodeInfo, number_in, summarize
 from deal_hw.data.recording.reader import Episode, check_description, read_episode
 from deal_hw.description import RobotDescription, digest_of
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
@@ -25,10 +26,14 @@ from deal_hw.schema import STRICT
 
 SCHEMA_VERSION = 1
 POLICY_FOLDER = "policies"
+REMOVED_FOLDER = "removed"
+"""Folder of removed episodes; see :mod:`deal_hw.data.recording.removal`."""
 _WHAT = "the index of a dataset"
 _INDEX_BYTES = 64 * MIB
 """Largest index [B]; that of 10,000 episodes has some 30 MB."""
 _LOCK_NAME = ".lock"
+_SHOWN = 5
+"""Most episodes that one message lists."""
 Notify = Callable[[str], None]
 
 
@@ -53,12 +58,15 @@ class _Index:
 
     def __post_init__(self) -> None:
         check_description(self.description)
+        named = Counter(episode.file for episode in self.episodes)
+        if twice := next((file for file, count in named.items() if count > 1), ""):
+            raise ConfigurationError(f"the index names {twice} twice")
         if self.digest != digest_of(self.description):
             raise ConfigurationError("the index was edited: its digest is not that of its description")
 
 
 class Dataset:
-    """A folder of episodes; made by :meth:`create_or_open` or :meth:`open`.
+    """A folder of episodes; made by :meth:`create_or_open`, :meth:`open` or :meth:`edit`.
 
     A collector closes it or uses it in a ``with`` block; until then no other collector can append to it.
 
@@ -66,7 +74,8 @@ class Dataset:
         folder: Where it is.
         description: ``RobotDescription.to_json()`` of its robot.
         digest: Digest of the description.
-        episodes: Entry of the index for each episode, in order.
+        episodes: Entry of the index for each episode, in order. Its place there is not its number where
+            episodes were removed.
     """
 
     def __init__(
@@ -83,7 +92,7 @@ class Dataset:
         self.episodes = episodes
         self._lock = lock
         self._notify = notify
-        self._next = len(episodes)
+        self._next = 0
 
     @classmethod
     def create_or_open(
@@ -107,11 +116,7 @@ class Dataset:
             lock = _lock(folder)
         except OSError as error:
             raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
-        if lock < 0:
-            raise DatasetError(
-                f"dataset {folder} is in use by another collector; wait for it or name another folder"
-            )
-        try:
+        with _released_on_error(folder, lock):
             if (folder / INDEX_NAME).exists():
                 dataset = cls._load(folder, lock, notify)
                 _refuse_other(folder, dataset.description, facts)
@@ -119,9 +124,6 @@ class Dataset:
                 dataset = cls(folder, facts, (), lock, notify)
                 dataset._save()
             dataset._adopt()
-        except BaseException:
-            os.close(lock)
-            raise
         return dataset
 
     @classmethod
@@ -135,12 +137,7 @@ class Dataset:
         Raises:
             DatasetError: It is not a dataset or cannot be read.
         """
-        folder = Path(folder)
-        if not (folder / INDEX_NAME).is_file():
-            raise DatasetError(
-                f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, and "
-                "`deal-hw data import` makes one from files"
-            )
+        folder = _existing(folder)
         try:
             lock = _lock(folder)
         except OSError:
@@ -156,6 +153,27 @@ class Dataset:
         return dataset
 
     @classmethod
+    def edit(cls, folder: Path, notify: Notify = print) -> Self:
+        """Open a dataset to keep or remove episodes; it is locked until closed.
+
+        Args:
+            folder: The dataset.
+            notify: Called with a sentence for each repair.
+
+        Raises:
+            DatasetError: It is not a dataset, a collector has it open, or it cannot be read or written.
+        """
+        folder = _existing(folder)
+        try:
+            lock = _lock(folder)
+        except OSError as error:
+            raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
+        with _released_on_error(folder, lock):
+            dataset = cls._load(folder, lock, notify)
+            dataset._adopt()
+        return dataset
+
+    @classmethod
     def _load(cls, folder: Path, lock: int, notify: Notify) -> Self:
         path = folder / INDEX_NAME
         version = read_json(path, _Version, _WHAT, most=_INDEX_BYTES).schema_version
@@ -167,22 +185,71 @@ class Dataset:
         index = read_json(path, _Index, _WHAT, most=_INDEX_BYTES)
         return cls(folder, index.description, index.episodes, lock, notify)
 
-    def path(self, index: int) -> Path:
-        """Return the file of an episode; negative numbers count from the end.
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The episodes' numbers, in order; a removed episode leaves a gap."""
+        return tuple(episode.number for episode in self.episodes)
+
+    def info(self, number: int) -> EpisodeInfo:
+        """Return the index's entry for an episode; negative numbers count from the end.
 
         Raises:
             DatasetError: There is no such episode.
         """
-        if not -len(self.episodes) <= index < len(self.episodes):
+        found = [episode for episode in self.episodes if episode.number == number]
+        if not found and -len(self.episodes) <= number < 0:
+            found = [self.episodes[number]]
+        if not found:
+            last = f", the last is {self.numbers[-1]}" if self.episodes else ""
             raise DatasetError(
-                f"dataset {self.folder} has {len(self.episodes)} episodes; there is no number {index} (the "
-                "first is 0)"
+                f"dataset {self.folder} has {len(self.episodes)} episodes; there is no number {number} (the "
+                f"first is {self.numbers[0] if self.episodes else 0}{last})"
             )
-        return self.folder / self.episodes[index].file
+        return found[0]
 
-    def read(self, index: int) -> Episode:
+    def path(self, number: int) -> Path:
+        """Return the file of an episode; numbers and errors as :meth:`info`."""
+        return self.folder / self.info(number).file
+
+    def read(self, number: int) -> Episode:
         """Read an episode; errors as :func:`~deal_hw.data.recording.reader.read_episode` and :meth:`path`."""
-        return read_episode(self.path(index))
+        return read_episode(self.path(number))
+
+    def why_left_out(self, info: EpisodeInfo) -> str:
+        """Return why an episode is left out, and how to use it all the same, as text; "" if it is used."""
+        if not info.left_out:
+            return ""
+        text = f"episode {info.number} is left out: {info.left_out}"
+        if info.failed_checks:
+            return f"{text}; also {'; '.join(info.failed_checks)}"
+        return f"{text}; to use it all the same: deal-hw data keep {self.folder} {info.number}"
+
+    def used(self, notify: Notify) -> tuple[int, ...]:
+        """Return the numbers of the episodes that are used.
+
+        Args:
+            notify: Called with a sentence for each that is left out.
+
+        Raises:
+            DatasetError: All are left out.
+        """
+        left_out = [text for info in self.episodes if (text := self.why_left_out(info))]
+        if left_out and len(left_out) == len(self.episodes):
+            more = f". {len(left_out) - _SHOWN} more" if len(left_out) > _SHOWN else ""
+            raise DatasetError(f"dataset {self.folder}: {'. '.join(left_out[:_SHOWN])}{more}")
+        for text in left_out:
+            notify(text)
+        return tuple(info.number for info in self.episodes if not info.left_out)
+
+    def change(self, episodes: Sequence[EpisodeInfo]) -> None:
+        """Write another list of episodes to the index.
+
+        Raises:
+            DatasetError: The dataset was not opened for changes, or cannot be written.
+        """
+        self._require_lock()
+        self.episodes = tuple(sorted(episodes, key=lambda episode: episode.number))
+        self._save()
 
     def policy_path(self, digest: str) -> Path:
         """Return the path of a kept policy; ``digest`` is its file's SHA-256 or the first 16 digits of it."""
@@ -239,8 +306,7 @@ class Dataset:
         if Path(path).resolve() != (self.folder / file).resolve():
             raise DatasetError(f"{path} is not in {self.folder / 'episodes'}")
         info, episode = self._take(file, "", facts)
-        self.episodes = (*self.episodes, info)
-        self._save()
+        self.change((*self.episodes, info))
         return info, episode
 
     def close(self) -> None:
@@ -265,22 +331,22 @@ class Dataset:
     def _adopt(self) -> None:
         """Add recordings that the index does not name, because their collector was killed."""
         known = {episode.file for episode in self.episodes}
-        found = sorted((self.folder / "episodes").glob("[0-9]*.mcap"))
-        strays = [f"episodes/{path.name}" for path in found if f"episodes/{path.name}" not in known]
+        found = [f"episodes/{path.name}" for path in sorted((self.folder / "episodes").glob("[0-9]*.mcap"))]
+        strays = [file for file in found if file not in known]
         for file in strays:
             try:
                 info, _ = self._take(file, "added to the index after its collector was killed")
-            except DatasetError as error:
+            except (DatasetError, ConfigurationError) as error:
                 self._notify(f"{self.folder / file} is left out: {error}")
                 continue
             self._notify(
                 f"{self.folder / file} was not in the index; it was added, with {info.states} state samples"
             )
-            self.episodes = (*self.episodes, info)
-        if strays:
-            self._save()
-        numbers = [int(path.stem) for path in found if path.stem.isdigit()]
-        self._next = max([len(self.episodes), *(number + 1 for number in numbers)])
+            self.change((*self.episodes, info))
+        removed = [f"episodes/{path.name}" for path in (self.folder / REMOVED_FOLDER).glob("*.mcap")]
+        # A number is never used twice, or results would name another episode than the one they are from.
+        taken = [number for file in (*found, *removed) if (number := number_in(file)) is not None]
+        self._next = max([-1, *taken, *self.numbers]) + 1
 
     def _save(self) -> None:
         values = {
@@ -298,7 +364,8 @@ class Dataset:
     def _require_lock(self) -> None:
         if self._lock < 0:
             raise DatasetError(
-                f"dataset {self.folder} is open for reading only; a collector uses Dataset.create_or_open"
+                f"dataset {self.folder} is open for reading only; a collector uses Dataset.create_or_open, "
+                "a change of its episodes Dataset.edit"
             )
 
     def __enter__(self) -> Self:
@@ -308,6 +375,50 @@ class Dataset:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder of a dataset that is there.
+
+    Raises:
+        DatasetError: It is not a dataset.
+    """
+    folder = Path(folder)
+    if not (folder / INDEX_NAME).is_file():
+        raise DatasetError(
+            f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, and "
+            "`deal-hw data import` makes one from files"
+        )
+    return folder
+
+
+@contextlib.contextmanager
+def _released_on_error(folder: Path, lock: int) -> Iterator[None]:
+    """Release the lock of a dataset if the block raises.
+
+    Raises:
+        DatasetError: Another process holds the lock.
+    """
+    if lock < 0:
+        raise DatasetError(
+            f"dataset {folder} is in use by another collector; wait for it or name another folder"
+        )
+    try:
+        yield
+    except BaseException:
+        os.close(lock)
+        raise
+
+
+def entry_of(path: Path) -> EpisodeInfo | None:
+    """Return the index's entry for an episode's file; None if no dataset that can be read has it."""
+    path = Path(path).resolve()
+    index = path.parent.parent / INDEX_NAME
+    with contextlib.suppress(DatasetError):
+        if path.parent.name == "episodes" and index.is_file():
+            episodes = read_json(index, _Index, _WHAT, most=_INDEX_BYTES).episodes
+            return next((one for one in episodes if Path(one.file).name == path.name), None)
+    return None
 
 
 def _lock(folder: Path) -> int:
