@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from deal_hw.data.checks.spikes import with_samples
 from deal_hw.errors import short
 from deal_hw.findings import Finding, Severity
@@ -42,18 +44,24 @@ def followed_part(trajectory: Trajectory) -> Trajectory:
     if until_s == math.inf:
         return trajectory
     sent = trajectory.sent_s < until_s
-    part = with_samples(trajectory, trajectory.receive_s < until_s)
+    part = with_samples(trajectory, np.logical_and.accumulate(trajectory.receive_s < until_s))
     return dataclasses.replace(part, **{name: getattr(part, name)[sent] for name in _SENT})
+
+
+def what_is_cut(trajectory: Trajectory) -> str:
+    """Return how much of a recording :func:`followed_part` leaves out, and why, as text; "" if nothing."""
+    until_s = followed_until_s(trajectory)
+    if not trajectory.receive_s.size or trajectory.receive_s[-1] < until_s:
+        return ""
+    cut_s = float(trajectory.receive_s[-1]) - max(until_s, float(trajectory.receive_s[0]))
+    return f"the last {cut_s:.1f} s are left out: {_who(trajectory)} commands"
 
 
 def check_following(trajectory: Trajectory) -> Finding:
     """Report joints that did not follow their commands, and how much is left out for it."""
-    until_s = followed_until_s(trajectory)
-    end_s = float(trajectory.receive_s[-1]) if trajectory.receive_s.size else 0.0
-    if end_s < until_s:
-        return Finding("following", Severity.OK, "the joints followed their commands")
-    left_out_s = end_s - max(until_s, float(trajectory.receive_s[0]))
-    text = f"the last {left_out_s:.1f} s are left out: {_who(trajectory)} commands"
+    if not (text := what_is_cut(trajectory)):
+        text = "no event says that a joint did not follow its commands"
+        return Finding("following", Severity.OK, text)
     return Finding("following", Severity.WARN, text, "check power, e-stop and controller of the drives")
 
 

@@ -7,62 +7,27 @@ import fcntl
 import hashlib
 import json
 import os
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import Self
 
-from deal_hw.data.files import INDEX_NAME, write_bytes, write_json
+from deal_hw.data.files import INDEX_NAME, write_bytes
+from deal_hw.data.recording.dataset_index import read_index, write_index
 from deal_hw.data.recording.episode_info import EpisodeInfo, number_in, summarize
-from deal_hw.data.recording.reader import Episode, check_description, read_episode
+from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription, digest_of
 from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
-from deal_hw.reading import MIB, read_json
-from deal_hw.schema import STRICT
 
-SCHEMA_VERSION = 1
 POLICY_FOLDER = "policies"
 REMOVED_FOLDER = "removed"
 """Folder of removed episodes; see :mod:`deal_hw.data.recording.removal`."""
-_WHAT = "the index of a dataset"
-_INDEX_BYTES = 64 * MIB
-"""Largest index [B]; that of 10,000 episodes has some 30 MB."""
 _LOCK_NAME = ".lock"
 _SHOWN = 5
 """Most episodes that one message lists."""
 Notify = Callable[[str], None]
-
-
-@dataclass(frozen=True, slots=True)
-class _Version:
-    """The part of an index that every version of deal-hw writes."""
-
-    schema_version: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Index:
-    """``dataset.json``."""
-
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
-
-    schema_version: int
-    robot: str
-    digest: str
-    description: Mapping[str, Any]
-    episodes: tuple[EpisodeInfo, ...]
-
-    def __post_init__(self) -> None:
-        check_description(self.description)
-        named = Counter(episode.file for episode in self.episodes)
-        if twice := next((file for file, count in named.items() if count > 1), ""):
-            raise ConfigurationError(f"the index names {twice} twice")
-        if self.digest != digest_of(self.description):
-            raise ConfigurationError("the index was edited: its digest is not that of its description")
 
 
 class Dataset:
@@ -122,7 +87,7 @@ class Dataset:
                 _refuse_other(folder, dataset.description, facts)
             else:
                 dataset = cls(folder, facts, (), lock, notify)
-                dataset._save()
+                write_index(folder, facts, ())
             dataset._adopt()
         return dataset
 
@@ -175,14 +140,7 @@ class Dataset:
 
     @classmethod
     def _load(cls, folder: Path, lock: int, notify: Notify) -> Self:
-        path = folder / INDEX_NAME
-        version = read_json(path, _Version, _WHAT, most=_INDEX_BYTES).schema_version
-        if version != SCHEMA_VERSION:
-            raise DatasetError(
-                f"{path} has schema version {version}, expected {SCHEMA_VERSION}; "
-                "it was written by another version of deal-hw"
-            )
-        index = read_json(path, _Index, _WHAT, most=_INDEX_BYTES)
+        index = read_index(folder)
         return cls(folder, index.description, index.episodes, lock, notify)
 
     @property
@@ -249,7 +207,7 @@ class Dataset:
         """
         self._require_lock()
         self.episodes = tuple(sorted(episodes, key=lambda episode: episode.number))
-        self._save()
+        write_index(self.folder, self.description, self.episodes)
 
     def policy_path(self, digest: str) -> Path:
         """Return the path of a kept policy; ``digest`` is its file's SHA-256 or the first 16 digits of it."""
@@ -348,19 +306,6 @@ class Dataset:
         taken = [number for file in (*found, *removed) if (number := number_in(file)) is not None]
         self._next = max([-1, *taken, *self.numbers]) + 1
 
-    def _save(self) -> None:
-        values = {
-            "schema_version": SCHEMA_VERSION,
-            "robot": self.description["name"],
-            "digest": self.digest,
-            "description": self.description,
-            "episodes": [asdict(episode) for episode in self.episodes],
-        }
-        try:
-            write_json(self.folder / INDEX_NAME, values)
-        except OSError as error:
-            raise DatasetError(f"{self.folder / INDEX_NAME} cannot be written: {error.strerror}") from error
-
     def _require_lock(self) -> None:
         if self._lock < 0:
             raise DatasetError(
@@ -408,17 +353,6 @@ def _released_on_error(folder: Path, lock: int) -> Iterator[None]:
     except BaseException:
         os.close(lock)
         raise
-
-
-def entry_of(path: Path) -> EpisodeInfo | None:
-    """Return the index's entry for an episode's file; None if no dataset that can be read has it."""
-    path = Path(path).resolve()
-    index = path.parent.parent / INDEX_NAME
-    with contextlib.suppress(DatasetError):
-        if path.parent.name == "episodes" and index.is_file():
-            episodes = read_json(index, _Index, _WHAT, most=_INDEX_BYTES).episodes
-            return next((one for one in episodes if Path(one.file).name == path.name), None)
-    return None
 
 
 def _lock(folder: Path) -> int:
