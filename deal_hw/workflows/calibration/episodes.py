@@ -16,7 +16,7 @@ from deal_hw.data.recording.episode_info import EpisodeInfo, motion_of
 from deal_hw.data.recording.excitation import FEWEST_CHANGES, LEAST_MOTION
 from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import SensorModel
-from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.errors import ConfigurationError, DealHwError, InsufficientDataError
 from deal_hw.workflows.robot import carries_robot
 from deal_hw.workflows.say import Say, silent
 
@@ -99,10 +99,11 @@ def nothing_to_fit(dataset: Dataset, held: Collection[int], failed: Collection[i
         if info.states and not info.failed_checks and info.number not in failed:
             usable.append(info)
     text = f"nothing to fit: {dataset.folder} has {len(reasons)} episodes. {'. '.join(reasons)}"
+    text += f". {_record_one(dataset)}"
     if usable and not too_little(dataset, usable):
         numbers = " ".join(str(info.number) for info in usable)
-        return f"{text}. To fit them all the same: deal-hw calibrate {dataset.folder} --episodes {numbers}"
-    return f"{text}. {_record_one(dataset)}"
+        text += f". To fit what is there: deal-hw calibrate {dataset.folder} --episodes {numbers}"
+    return text
 
 
 def refusal(dataset: Dataset) -> str:
@@ -114,7 +115,7 @@ def refusal(dataset: Dataset) -> str:
         fit, held = choose_episodes(dataset, (), ())
         sound = {info.number for info in dataset.episodes if not info.failed_checks}
         fit, _ = remaining(dataset, fit, held, sound)
-    except (ConfigurationError, InsufficientDataError) as error:
+    except DealHwError as error:
         return str(error)
     little = too_little(dataset, [dataset.info(number) for number in fit])
     return f"{little}. {_record_one(dataset)}" if little else ""
