@@ -140,6 +140,15 @@ def test_episodes_are_kept_and_removed(
     assert Dataset.open(dataset).numbers == () and len(list((dataset / "removed").iterdir())) == 4
 
 
+def test_info_of_a_file_with_any_name(
+    write_episode: WriteEpisode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A copy elsewhere has no number and no index."""
+    assert data(InfoSettings(path=write_episode("copy.mcap"), json=True)) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["number"], shown["left_out"], shown["file"]) == (-1, "", "episodes/copy.mcap")
+
+
 def test_verify_then_repair(
     dataset: Path, write_episode: WriteEpisode, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,8 +52,8 @@ def test_a_failed_run_is_left_out_until_it_is_kept(dataset: Path) -> None:
     (info,) = edited(dataset, keep_episodes, 1)
     assert info.failure and not info.left_out
     assert Dataset.open(dataset).used(output.append) == (0, 1, 2)
-    (same,) = edited(dataset, keep_episodes, 0)
-    assert same.facts == {"outcome": "finished"}
+    (same,) = edited(dataset, keep_episodes, 0, 0, -4)
+    assert same.facts == {"outcome": "finished"} and Dataset.open(dataset).numbers == (0, 1, 2, 3)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_what_fails_a_run(dataset: Path, facts: dict[str, Any], why: str) -> Non
 
 def test_removed_episodes_are_moved_and_numbers_stay(dataset: Path, write_episode: WriteEpisode) -> None:
     """The others keep their numbers, and no number is used twice."""
-    removed = edited(dataset, remove_episodes, 1, 3, 1)
+    removed = edited(dataset, remove_episodes, 1, 3, 1, -1)
     assert [info.number for info in removed] == [1, 3] and removed_numbers(dataset) == (1, 3)
     after = Dataset.open(dataset)
     assert after.numbers == (0, 2)
@@ -165,3 +165,14 @@ def test_an_episode_has_one_name_for_its_number(
     output: list[str] = []
     assert Dataset.open(dataset, output.append).numbers == (0, 1, 2, 3)
     assert len(output) == 1 and "is left out" in output[0] and "such as episodes/000007.mcap" in output[0]
+    with Dataset.create_or_open(dataset, DESCRIPTION, output.append) as store:
+        with pytest.raises(DatasetError, match="has no name such as"):
+            store.note_episode(dataset / "episodes" / name)
+        (dataset / "removed").mkdir()
+        for suffix in (".mcap", ".json"):
+            (dataset / "removed" / name).with_suffix(suffix).touch()
+        assert removed_numbers(dataset) == () and store.next_episode_path().name == "000004.mcap"
+    index = dataset / "dataset.json"
+    index.write_text(index.read_text().replace("000003.mcap", name.replace("\u0662", "a")))
+    with pytest.raises(DatasetError, match="has no name such as"):
+        Dataset.open(dataset)

@@ -16,10 +16,10 @@ from typing_extensions import Self
 
 from deal_hw.data.files import INDEX_NAME, write_bytes
 from deal_hw.data.recording.dataset_index import read_index, write_index
-from deal_hw.data.recording.episode_info import EpisodeInfo, number_in, summarize
+from deal_hw.data.recording.episode_info import EXAMPLE, EpisodeInfo, number_in, summarize
 from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription, digest_of
-from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
+from deal_hw.errors import DatasetError, EmptyRecordingError
 
 POLICY_FOLDER = "policies"
 REMOVED_FOLDER = "removed"
@@ -261,8 +261,10 @@ class Dataset:
         """
         self._require_lock()
         file = f"episodes/{Path(path).name}"
-        if Path(path).resolve() != (self.folder / file).resolve():
-            raise DatasetError(f"{path} is not in {self.folder / 'episodes'}")
+        if Path(path).resolve() != (self.folder / file).resolve() or number_in(file) < 0:
+            raise DatasetError(
+                f"{path} is not in {self.folder / 'episodes'}, or has no name such as {EXAMPLE}"
+            )
         info, episode = self._take(file, "", facts)
         self.change((*self.episodes, info))
         return info, episode
@@ -293,8 +295,10 @@ class Dataset:
         strays = [file for file in found if file not in known]
         for file in strays:
             try:
+                if number_in(file) < 0:
+                    raise DatasetError(f"it has no name such as {EXAMPLE}; rename it")
                 info, _ = self._take(file, "added to the index after its collector was killed")
-            except (DatasetError, ConfigurationError) as error:
+            except DatasetError as error:
                 self._notify(f"{self.folder / file} is left out: {error}")
                 continue
             self._notify(
@@ -303,8 +307,7 @@ class Dataset:
             self.change((*self.episodes, info))
         removed = [f"episodes/{path.name}" for path in (self.folder / REMOVED_FOLDER).glob("*.mcap")]
         # A number is never used twice, or results would name another episode than the one they are from.
-        taken = [number for file in (*found, *removed) if (number := number_in(file)) is not None]
-        self._next = max([-1, *taken, *self.numbers]) + 1
+        self._next = max([-1, *map(number_in, (*found, *removed)), *self.numbers]) + 1
 
     def _require_lock(self) -> None:
         if self._lock < 0:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from deal_hw.data.files import INDEX_NAME, write_json
-from deal_hw.data.recording.episode_info import EpisodeInfo
+from deal_hw.data.recording.episode_info import EXAMPLE, EpisodeInfo
 from deal_hw.data.recording.reader import check_description
 from deal_hw.description import digest_of
-from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.errors import ConfigurationError, DatasetError, shown
 from deal_hw.reading import MIB, read_json
 from deal_hw.schema import STRICT
 
@@ -42,7 +42,8 @@ class DatasetIndex:
         episodes: An entry for each episode.
 
     Raises:
-        ConfigurationError: The description is none or was changed, or a file has two entries.
+        ConfigurationError: The description is none or was changed, a file has two entries, or its name has no
+            number.
     """
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
@@ -55,6 +56,8 @@ class DatasetIndex:
 
     def __post_init__(self) -> None:
         check_description(self.description)
+        if unnumbered := next((one.file for one in self.episodes if one.number < 0), ""):
+            raise ConfigurationError(f"episode file {shown(unnumbered)} has no name such as {EXAMPLE}")
         named = Counter(episode.file for episode in self.episodes)
         if twice := next((file for file, count in named.items() if count > 1), ""):
             raise ConfigurationError(f"the index names {twice} twice")

@@ -20,6 +20,8 @@ KEPT = "kept"
 """Fact of an episode that the user wants to use although its run failed."""
 _FAILED = {"tripped": "the safety module ended it", "failed": "its run failed"}
 """Outcomes of runs whose recordings are left out, in words."""
+EXAMPLE = "episodes/000007.mcap"
+"""A name of an episode's file in its dataset, for messages."""
 _FILE = re.compile(r"episodes/(\d{6,9})\.mcap", re.ASCII)
 _MOST_JUMPS = 20
 """Largest number of clock jumps in an entry; a recording with very many must not fill the index."""
@@ -70,10 +72,10 @@ class EpisodeInfo:
 
     def __post_init__(self) -> None:
         # The file field decides which file is read, and dataset.json may come from elsewhere.
-        if number_in(self.file) is None:
+        parts = Path(self.file).parts
+        if len(parts) != 2 or parts[0] != "episodes" or ".." in parts or "\0" in self.file:
             raise ConfigurationError(
-                f"episode file {shown(self.file)} is not inside the dataset's episodes/ folder, or has no "
-                "name such as episodes/000007.mcap"
+                f"episode file {shown(self.file)} is not inside the dataset's episodes/ folder"
             )
         for verdict in self.verdicts:
             if _VERDICT - verdict.keys() or verdict["severity"] not in tuple(Severity):
@@ -87,8 +89,8 @@ class EpisodeInfo:
 
     @property
     def number(self) -> int:
-        """The episode's number, that of its file. It stays when other episodes are removed."""
-        return int(Path(self.file).stem)
+        """The episode's number, that of its file; it stays when other episodes are removed. -1: none."""
+        return number_in(self.file)
 
     @property
     def failure(self) -> str:
@@ -112,11 +114,11 @@ class EpisodeInfo:
         return tuple(verdict["message"] for verdict in self.verdicts if verdict["severity"] == Severity.FAIL)
 
 
-def number_in(file: str) -> int | None:
-    """Return the number of an episode from its file in the dataset; None if that is no such file."""
+def number_in(file: str) -> int:
+    """Return the number of an episode from its file in the dataset; -1 if that has no such name."""
     found = _FILE.fullmatch(file)
     # One number has one name: 000001, not 0000001.
-    return int(found[1]) if found and found[1] == f"{int(found[1]):06d}" else None
+    return int(found[1]) if found and found[1] == f"{int(found[1]):06d}" else -1
 
 
 def _is_number(value: object) -> bool:

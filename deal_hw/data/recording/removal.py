@@ -13,7 +13,7 @@ from pathlib import Path
 
 from deal_hw.data.files import write_json
 from deal_hw.data.recording.dataset import REMOVED_FOLDER, Dataset
-from deal_hw.data.recording.episode_info import KEPT, EpisodeInfo
+from deal_hw.data.recording.episode_info import KEPT, EpisodeInfo, number_in
 from deal_hw.errors import DatasetError
 from deal_hw.reading import read_json
 
@@ -21,7 +21,8 @@ from deal_hw.reading import read_json
 def removed_numbers(folder: Path) -> tuple[int, ...]:
     """Return the numbers of the episodes that were removed from a dataset and can be put back."""
     files = (Path(folder) / REMOVED_FOLDER).glob("*.mcap")
-    return tuple(sorted(int(file.stem) for file in files if file.with_suffix(".json").is_file()))
+    found = (number_in(f"episodes/{file.name}") for file in files if file.with_suffix(".json").is_file())
+    return tuple(sorted(number for number in found if number >= 0))
 
 
 def remove_episodes(dataset: Dataset, numbers: Iterable[int]) -> tuple[EpisodeInfo, ...]:
@@ -30,20 +31,20 @@ def remove_episodes(dataset: Dataset, numbers: Iterable[int]) -> tuple[EpisodeIn
     Raises:
         DatasetError: There is no such episode, or a file cannot be written; then none is removed.
     """
-    removed = tuple(dataset.info(number) for number in dict.fromkeys(numbers))
+    removed = {info.number: info for info in map(dataset.info, numbers)}
     try:
         (dataset.folder / REMOVED_FOLDER).mkdir(exist_ok=True)
-        for info in removed:
-            write_json(_entry(dataset.folder, info.number), asdict(info))
-        dataset.change([info for info in dataset.episodes if info not in removed])
-        for info in removed:
-            os.replace(dataset.folder / info.file, _file(dataset.folder, info.number))
+        for number, info in removed.items():
+            write_json(_entry(dataset.folder, number), asdict(info))
+        dataset.change([info for info in dataset.episodes if info.number not in removed])
+        for number, info in removed.items():
+            os.replace(dataset.folder / info.file, _file(dataset.folder, number))
     except OSError as error:
         raise DatasetError(
             f"{dataset.folder / REMOVED_FOLDER} cannot be written: {error.strerror}; what is not there stays "
             "in the dataset"
         ) from error
-    return removed
+    return tuple(removed.values())
 
 
 def keep_episodes(dataset: Dataset, numbers: Sequence[int]) -> tuple[EpisodeInfo, ...]:
@@ -56,12 +57,11 @@ def keep_episodes(dataset: Dataset, numbers: Sequence[int]) -> tuple[EpisodeInfo
     Raises:
         DatasetError: There is no such episode, or it cannot be used or put back; then nothing is changed.
     """
-    numbers = tuple(dict.fromkeys(numbers))
     removed = set(removed_numbers(dataset.folder)) - set(dataset.numbers)
     back = {number: _removed(dataset.folder, number) for number in numbers if number in removed}
-    found = {number: back.get(number) or dataset.info(number) for number in numbers}
+    found = [back.get(number) or dataset.info(number) for number in numbers]
     kept = {
-        n: replace(one, facts={**one.facts, KEPT: True}) if one.failure else one for n, one in found.items()
+        one.number: replace(one, facts={**one.facts, KEPT: True}) if one.failure else one for one in found
     }
     for number, info in kept.items():
         if info.left_out:
