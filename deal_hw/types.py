@@ -19,7 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 NOT_FOLLOWING: Final = "not following"
-"""Kind of the event that joints did not follow their commands: ``since_ns`` (host clock) and ``joints``."""
+"""Kind of the :class:`Event` that joints do not follow their commands, until the recording's end. Its data:
+``since_ns``, the host clock from which on they do not [ns], and ``joints``, their names."""
 
 
 class Status(enum.IntFlag):

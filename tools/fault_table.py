@@ -115,7 +115,7 @@ def recording(folder: Path) -> dict[str, Any]:
         return {"dataset": "none", "states": 0, "last_cycle_ns": -1}
     try:
         opened = Dataset.open(folder, notify=lambda text: None)
-        episodes = [opened.read(i) for i in range(len(opened.episodes))]
+        episodes = [opened.read(number) for number in opened.numbers]
     except (DealHwError, OSError) as error:
         # A run that ended before the first state has a sound file without one.
         word = "empty" if "no state sample" in str(error) else f"not readable: {error}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from deal_hw.calib.data.parts import longest_windows, taken
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.data.recording.excitation import SHORTEST_S
+from deal_hw.data.recording.excitation import FEWEST_CHANGES, LEAST_MOTION, SHORTEST_S
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.engine.batch import COMMAND_DELAY
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -80,15 +80,9 @@ def target_changes(episodes: Sequence[SampledEpisode]) -> int:
     return sum(int(np.count_nonzero(np.any(np.diff(e.target, axis=0) != 0, axis=1))) for e in episodes)
 
 
-LEAST_MOTION = 20.0
-"""Least motion of a joint [multiples of the sensor's noise]."""
-
 LEAST_CHOSEN_MOTION = 5.0
 """The same where the residual scale was chosen. That scale includes model error and is far above the
 sensor's noise."""
-
-FEWEST_CHANGES = 5
-"""Fewest changes of the target."""
 
 WINDOW_S = 0.5
 """Length of the windows [s]."""

@@ -7,6 +7,7 @@ from deal_hw.cli.show import Terminal
 from deal_hw.control.process.channel import Outcome
 from deal_hw.workflows.collect import COLLECT, CollectSettings, CollectSimulatedSettings, run
 from deal_hw.workflows.running.report import RunReport
+from deal_hw.workflows.say import to_stderr
 
 KINDS = COLLECT.with_options(Quiet)
 
@@ -17,8 +18,14 @@ def collect(config: CollectSettings | CollectSimulatedSettings) -> RunReport:
 
 
 def collect_and_say_next(config: CollectSettings | CollectSimulatedSettings) -> RunReport:
-    """Run the verb, and print the line that calibrates from the recordings."""
+    """Run the verb, and print the line that calibrates from the recordings, or what they still lack."""
     report = collect(config)
-    if report.outcome is Outcome.FINISHED and not is_quiet(config):
-        print(f"next: deal-hw calibrate {report.dataset}")
+    if report.outcome is Outcome.FINISHED and report.dataset is not None and not is_quiet(config):
+        from deal_hw.data.recording.dataset import Dataset
+        from deal_hw.workflows.calibration.episodes import refusal
+
+        if refused := refusal(Dataset.open(report.dataset, to_stderr)):
+            print(f"not enough for a calibration: {refused}")
+        else:
+            print(f"next: deal-hw calibrate {report.dataset}")
     return report

@@ -1,20 +1,23 @@
-"""`deal-hw data`: show, verify, repair, import and export recordings."""
+"""`deal-hw data`: show, verify, repair, keep, remove, import and export recordings."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated
 
 import tyro
 
+from deal_hw.cli.data_info import print_info
+from deal_hw.cli.show import Terminal
 from deal_hw.data.files import INDEX_NAME, dataset_of
-from deal_hw.data.recording.dataset import Dataset
-from deal_hw.data.recording.episode_info import EpisodeInfo, motion_of, summarize
+from deal_hw.data.recording.dataset import REMOVED_FOLDER, Dataset
+from deal_hw.data.recording.episode_info import EpisodeInfo, motion_of
+from deal_hw.data.recording.removal import keep_episodes, remove_episodes
 from deal_hw.data.recording.repair import RepairReport, repair, verify
-from deal_hw.errors import DatasetError
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.ranges import Checked, Range
 from deal_hw.workflows.import_export import (
     ExportSettings,
     ImportSettings,
@@ -22,16 +25,12 @@ from deal_hw.workflows.import_export import (
     import_recordings,
 )
 from deal_hw.workflows.kinds import InputKind, sub_verbs
-from deal_hw.workflows.robot import carried_problems, carries_robot
+from deal_hw.workflows.robot import carried_problems
 from deal_hw.workflows.say import to_stderr
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
 EXIT_OK, EXIT_UNSOUND = 0, 1
-_COLOURS = {"ok": "green", "warn": "yellow", "fail": "red"}
+Numbers = Annotated[tuple[int, ...], Range(0, 1_000_000)]
+"""Numbers of episodes; the first is 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +64,28 @@ class Repair:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Keep(Checked):
+    """Use episodes although their run tripped or failed, and put removed ones back."""
+
+    path: tyro.conf.Positional[Path]
+    """A dataset (DIR)."""
+    episodes: tyro.conf.Positional[Numbers]
+    """Numbers of the episodes; `deal-hw data info DIR` shows them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Remove(Checked):
+    """Take episodes out of a dataset; their files move to DIR/removed."""
+
+    path: tyro.conf.Positional[Path]
+    """A dataset (DIR)."""
+    episodes: tyro.conf.Positional[Numbers]
+    """Numbers of the episodes; `deal-hw data info DIR` shows them. Those of the others stay as they are."""
+    yes: bool = False
+    """Do not ask."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Import(ImportSettings):
     """Make a dataset from plausible recordings of any robot."""
 
@@ -83,23 +104,24 @@ KINDS = sub_verbs(
         "info": InputKind(InfoSettings, example="info runs/first/dataset"),
         "verify": InputKind(Verify, example="verify runs/first/dataset"),
         "repair": InputKind(Repair, example="repair runs/first/dataset"),
+        "keep": InputKind(Keep, example="keep runs/first/dataset 0"),
+        "remove": InputKind(Remove, example="remove runs/first/dataset 0"),
         "import": InputKind(Import, example="import rec.csv --robot robot.yaml --out runs/mine/dataset"),
         "export": InputKind(Export, example="export runs/first/dataset --out exported"),
     }
 )
 
 
-def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
+def data(config: InfoSettings | Verify | Repair | Keep | Remove | Import | Export) -> int:
     """Run the verb.
 
     Returns:
-        0, or 1 where a file is torn or damaged and was not repaired.
+        0, or 1 where a file is torn or damaged and was not repaired, or nothing was removed.
 
     Raises:
         DatasetError: The path is neither a dataset nor an episode, or cannot be read or written.
+        ConfigurationError: Nobody can answer whether to remove episodes.
     """
-    if isinstance(config, InfoSettings):
-        return _info(replace(config, path=dataset_of(config.path)))
     if isinstance(config, Import):
         dataset = import_recordings(config, to_stderr)
         if dataset is not None:
@@ -111,10 +133,56 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
         layout = {"lerobot": "LeRobot", "foxglove": "Foxglove"}[config.format]
         print(f"{config.out}: {count} {layout} episode{'s' * (count != 1)} of {robot}")
         return EXIT_OK
-    config = replace(config, path=dataset_of(config.path))
-    reports, errors = _each(_episode_files(config.path), isinstance(config, Repair))
-    errors += carried_problems(config.path)
-    if config.json:
+    path = dataset_of(config.path)
+    if isinstance(config, InfoSettings):
+        print_info(path, config.json)
+        return EXIT_OK
+    if isinstance(config, Keep):
+        return _keep(path, config.episodes)
+    if isinstance(config, Remove):
+        return _remove(path, config.episodes, config.yes)
+    return _verify(path, isinstance(config, Repair), config.json)
+
+
+def _keep(path: Path, numbers: tuple[int, ...]) -> int:
+    with Dataset.edit(path, to_stderr) as dataset:
+        before = {info.number: info for info in dataset.episodes}
+        for info in keep_episodes(dataset, numbers):
+            back = "put back, and used" if info.number not in before else "used"
+            why = f" although {info.failure}" if info.failure else ""
+            print(f"episode {info.number} is {back}{why}")
+            if info.failed_checks:
+                print(f"  but calibrate still leaves it out: {'; '.join(info.failed_checks)}")
+    return EXIT_OK
+
+
+def _remove(path: Path, numbers: tuple[int, ...], yes: bool) -> int:
+    dataset = Dataset.open(path, to_stderr)
+    chosen = [dataset.info(number) for number in dict.fromkeys(numbers)]
+    if not yes:
+        question = f"move {'it' if len(chosen) == 1 else 'them'} to {path / REMOVED_FOLDER}?"
+        answer = Terminal().confirm("\n".join(map(_described, chosen)), question)
+        if answer is None:
+            raise ConfigurationError("nothing was removed: nobody can answer here; add --yes")
+        if not answer:
+            print("nothing was removed")
+            return EXIT_UNSOUND
+    with Dataset.edit(path, to_stderr) as dataset:
+        removed = " ".join(str(info.number) for info in remove_episodes(dataset, numbers))
+    print(f"removed: {removed}, to {path / REMOVED_FOLDER}; to put back: deal-hw data keep {path} {removed}")
+    return EXIT_OK
+
+
+def _described(info: EpisodeInfo) -> str:
+    words = " ".join(filter(None, (info.purpose, motion_of(info.facts))))
+    return f"episode {info.number}: {words}, {info.duration_s:.1f} s{info.failure and f', {info.failure}'}"
+
+
+def _verify(path: Path, mend: bool, as_json: bool) -> int:
+    """Check files, or repair them; return the exit code."""
+    reports, errors = _each(_episode_files(path), mend)
+    errors += carried_problems(path)
+    if as_json:
         values = [{**asdict(report), "sound": report.sound} for report in reports]
         print(json.dumps({"files": values, "errors": errors}, indent=2, default=str))
     else:
@@ -122,9 +190,9 @@ def data(config: InfoSettings | Verify | Repair | Import | Export) -> int:
             print(report.describe())
         for error in errors:
             print(f"error: {error}")
-    if isinstance(config, Repair) and (config.path / INDEX_NAME).is_file():
+    if mend and (path / INDEX_NAME).is_file():
         # Opening also indexes new episodes, such as that of a killed collector.
-        Dataset.open(config.path)
+        Dataset.open(path)
     return (
         EXIT_OK if not errors and all(report.sound or report.repaired for report in reports) else EXIT_UNSOUND
     )
@@ -156,169 +224,3 @@ def _episode_files(path: Path) -> list[Path]:
             "dataset (DIR) or an episode (DIR/episodes/000000.mcap)"
         )
     return files
-
-
-def _info(config: InfoSettings) -> int:
-    from rich.console import Console
-
-    console = Console()
-    if not config.path.is_dir():
-        episode, recorded = summarize(config.path, f"episodes/{config.path.name}")
-        if config.json:
-            print(json.dumps(asdict(episode), indent=2))
-        else:
-            _print_episode(console, episode)
-            if recorded is not None:
-                console.print(_motion_table(episode.excitation or {}, recorded.description))
-        return EXIT_OK
-    notes: list[str] = []
-    dataset = Dataset.open(config.path, notes.append)
-    if config.json:
-        values = {
-            "folder": str(dataset.folder),
-            "robot": dataset.description["name"],
-            "digest": dataset.digest,
-            "carries_robot": carries_robot(dataset.folder),
-            "episodes": [asdict(episode) for episode in dataset.episodes],
-            "notes": notes,
-        }
-        print(json.dumps(values, indent=2))
-        return EXIT_OK
-    for note in notes:
-        console.print(note, style="yellow", markup=False)
-    console.print(_dataset_table(dataset))
-    if carries_robot(dataset.folder):
-        console.print(f"its robot: {dataset.folder / 'robot' / 'robot.yaml'}", markup=False)
-    for problem in carried_problems(dataset.folder):
-        console.print(problem, style="red", markup=False)
-    for episode in dataset.episodes:
-        _print_problems(console, episode)
-    return EXIT_OK
-
-
-def _dataset_table(dataset: Dataset) -> Table:
-    from rich.text import Text
-
-    # Text, since words from a file could look like markup.
-    title = Text(f"{dataset.folder}: {dataset.description['name']}, description {dataset.digest}")
-    table = _plain_table(title)
-    table.add_column("no.", justify="right", no_wrap=True)
-    table.add_column("motion")
-    table.add_column("UTC", no_wrap=True)
-    for name in ("s", "states", "sent"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("moves by", no_wrap=True)
-    table.add_column("checks", no_wrap=True)
-    for episode in dataset.episodes:
-        table.add_row(
-            str(int(Path(episode.file).stem)),
-            Text(_motion(episode)),
-            Text(episode.wall_utc[5:16].replace("T", " ")),
-            f"{episode.duration_s:.1f}",
-            str(episode.states),
-            str(episode.commands),
-            Text(_position_ranges(episode, dataset.description)),
-            _worst(episode),
-        )
-    return table
-
-
-def _plain_table(title: Text) -> Table:
-    """Return a table without vertical lines, which would take a quarter of 80 columns."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    return Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-
-
-def _motion(episode: EpisodeInfo) -> str:
-    """Return the purpose of an episode and its motion; a changed excitation level is a line of its own."""
-    level = float(episode.facts.get("excitation_level") or 0.0)
-    words = " ".join(filter(None, (episode.purpose, motion_of(episode.facts))))
-    return f"{words}\nlevel {level:+g}" if level else words
-
-
-def _position_ranges(episode: EpisodeInfo, description: Mapping[str, Any]) -> str:
-    """Return the range of each joint's positions; with more than two joints only the widest range."""
-    ranges = (episode.excitation or {}).get("position_range") or ()
-    units, names = description.get("position_units") or (), description.get("joint_names") or ()
-    parts = [f"{value:.2f} {unit}" for value, unit in zip(ranges, units, strict=False)]
-    if len(parts) == 2 and len(set(units)) == 1:
-        # The unit once, so that the row fits its line.
-        return ", ".join(parts).replace(f" {next(iter(units))},", ",")
-    if len(parts) <= 2:
-        return ", ".join(parts)
-    widest = max(range(len(parts)), key=lambda index: ranges[index])
-    return f"{parts[widest]} ({names[widest]})"
-
-
-def _clock_texts(episode: EpisodeInfo) -> tuple[str, str]:
-    clock: dict[str, Any] = dict(episode.clock or {})
-    if clock.get("offset_s") is None or clock.get("drift_ppm") is None:
-        return "-", "-"
-    offset, drift = f"{clock['offset_s'] * 1e3:+.3f} ms", f"{clock['drift_ppm']:+.0f} ppm"
-    if clock["offset_uncertainty_s"] is not None:
-        offset += f" +-{clock['offset_uncertainty_s'] * 1e3:.3f}"
-    if clock["drift_uncertainty_ppm"] is not None:
-        drift += f" +-{clock['drift_uncertainty_ppm']:.0f}"
-    return offset, drift
-
-
-def _worst(episode: EpisodeInfo) -> str:
-    severities = [verdict["severity"] for verdict in episode.verdicts]
-    for severity in ("fail", "warn"):
-        if severity in severities:
-            return f"[{_COLOURS[severity]}]{severities.count(severity)} {severity}[/]"
-    return "[green]ok[/]"
-
-
-def _print_problems(console: Console, episode: EpisodeInfo) -> None:
-    if episode.note:
-        console.print(f"{episode.file}: {episode.note}", style="yellow", markup=False)
-    for verdict in episode.verdicts:
-        if verdict["severity"] != "ok":
-            text = f"{episode.file}: {verdict['severity']} {verdict['name']}: {verdict['message']}"
-            console.print(text, style=_COLOURS[verdict["severity"]], markup=False)
-
-
-def _print_episode(console: Console, episode: EpisodeInfo) -> None:
-    from rich.text import Text
-
-    table = _plain_table(Text(f"{episode.file}: {episode.purpose} {episode.wall_utc[:19]} UTC"))
-    table.add_column("check", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
-    table.add_column("finding")
-    for verdict in episode.verdicts:
-        colour = _COLOURS[verdict["severity"]]
-        table.add_row(verdict["name"], f"[{colour}]{verdict['severity']}[/]", Text(verdict["message"]))
-    offset, drift = _clock_texts(episode)
-    table.add_row("clocks", "", f"host minus device {offset}, drift {drift}")
-    console.print(table)
-
-
-def _motion_table(excitation: Mapping[str, Any], description: Mapping[str, Any]) -> Table:
-    """Return how far and how fast each joint moved, and how its targets changed."""
-    from rich.text import Text
-
-    names, actuated = description["joint_names"], description["actuated"]
-    units = description.get("position_units") or [""] * len(names)
-    table = _plain_table(Text("motion of each joint; speeds are in units per second"))
-    table.add_column("joint")
-    for column in (
-        "unit",
-        "moves by",
-        "max speed",
-        "RMS speed",
-        "reversals",
-        "target range",
-        "target changes",
-    ):
-        table.add_column(column, justify="right")
-    for joint, (name, unit) in enumerate(zip(names, units, strict=False)):
-        cells = [f"{excitation[key][joint]:.3g}" for key in ("position_range", "speed_max", "speed_rms")]
-        cells.append(str(excitation["reversals"][joint]))
-        if name in actuated:
-            target = actuated.index(name)
-            cells += [f"{excitation['target_range'][target]:.3g}", str(excitation["target_changes"][target])]
-        table.add_row(Text(name), unit, *cells)
-    return table

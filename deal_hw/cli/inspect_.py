@@ -64,7 +64,7 @@ class InspectReport:
 
     Attributes:
         overlay: The predictions; None if the recording allows none.
-        note: Why there is no prediction; empty otherwise.
+        note: Why there is no prediction, or why it ends before the recording; empty otherwise.
         files: The written files.
     """
 

@@ -93,7 +93,7 @@ JOBS: Mapping[str, Verb] = MappingProxyType(
             extra="calib",
             config="KINDS",
             function="calibrate_or_write_parameters",
-            common="model data columns parameters write_parameters holdout leave_out method "
+            common="model data columns parameters write_parameters episodes holdout leave_out method "
             "search known space out resume json quiet",
         ),
         "train": _verb(
@@ -178,7 +178,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
         ),
         "data": _verb(
             "data",
-            help="show, verify and repair datasets; import and export recordings",
+            help="show, verify and repair datasets; keep and remove episodes; import and export recordings",
             config="KINDS",
             example="data info runs/first/dataset",
             extra="sim",

@@ -44,7 +44,7 @@ from deal_hw.viz.summary import summary_markdown, verdict_markdown
 APPLICATION = "deal-hw inspect"
 _BREAK_S = 1e-6
 """Offset of a break from its window's end, and of the next window's first point from the break."""
-_ALARMING = ("passive", "trip", "fault", "watchdog", "overrun", "stop", "lost", "error")
+_ALARMING = ("passive", "trip", "fault", "watchdog", "overrun", "stop", "lost", "error", "not following")
 
 
 def write_episode(
@@ -70,7 +70,7 @@ def write_episode(
         result: The calibration whose parameters are listed.
         verdict: Whether it can be used, in markdown.
         name: Name of the recording in the viewer.
-        note: One more sentence for the verdict, such as why there are no predictions.
+        note: One more sentence for the verdict, such as why there are no predictions or where they end.
     """
     alarms = () if result is None else result.alarms
     with rr.RecordingStream(APPLICATION, send_properties=False) as stream:

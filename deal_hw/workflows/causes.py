@@ -14,6 +14,8 @@ LATE = frozenset(
     {"state_stale", "action_late", "command_stale", "clock_jump", "device_watchdog", "device_disarmed"}
 )
 """Flags of the safety module (see `deal_hw.control.safety.safety`) that a busy computer can cause."""
+BY_MOTION = frozenset({"position", "velocity", "tilt", "tumble", "flail", "motor_temperature"})
+"""Flags that a gentler motion can avoid."""
 
 
 @dataclass(frozen=True, slots=True)

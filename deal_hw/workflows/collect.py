@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from deal_hw.data.recording.excitation import SHORTEST_S
+from deal_hw.data.checks.samples import SHORTEST_S
 from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.motions.excitation.level import ATTEMPTS, HIGHEST_LEVEL, LOWEST_LEVEL
 from deal_hw.ranges import Range
@@ -36,8 +36,6 @@ from deal_hw.workflows.shipped import balancing_policy, stands_alone
 
 EXCITATION_FILE = "excitation.json"
 """File of the excitation of `--excite optimal`, in the run folder."""
-SHORT_S = 1.5 * SHORTEST_S
-"""Shorter recordings give a warning, since not every sample is usable [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,10 +178,10 @@ def run(config: CollectSettings | CollectSimulatedSettings, view: RunView) -> Ru
         return _rehearse(config, view)
     policy = config.policy or balancing_policy(config.robot)
     excite, seconds = _excitation(config, view)
-    if seconds * config.episodes < SHORT_S:
+    if seconds < SHORTEST_S:
         view.note(
-            f"warning: {seconds * config.episodes:g} s in total are too short: `deal-hw calibrate` needs "
-            f"{SHORTEST_S:g} s of usable samples; record 4 s (--seconds 4)"
+            f"warning: {seconds:g} s are too short: `deal-hw calibrate` takes recordings of {SHORTEST_S:g} s "
+            "and more; record 4 s (--seconds 4)"
         )
     walks = config.motion == "balance" and not excite
     plan = RunPlan(

@@ -86,11 +86,13 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         DatasetError: A recording cannot be read, understood or trusted.
         ConfigurationError: The column map, model or description cannot be used.
     """
+    from deal_hw.data.checks.following import followed_part
     from deal_hw.data.importing.channels import digest_of_file
     from deal_hw.data.importing.columns import ColumnMap, read_column_map
     from deal_hw.data.importing.grid import common_period, to_trajectories
     from deal_hw.data.importing.load import MapOf, load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
+    from deal_hw.data.recording.dataset_index import entry_of_episode
     from deal_hw.data.recording.episode_info import verdict_json
     from deal_hw.data.table import table_of
     from deal_hw.workflows.ros2_columns import columns_of_robot
@@ -123,7 +125,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
             policy = OnnxPolicy(config.policy)
             tables = with_commands_of(policy, tables, facts, say)
         tables = at_rest_without_commands(tables, facts, say)
-    checked = [*(table_of(e.trajectory, e.path.name) for e in episodes), *tables]
+    checked = [*(table_of(followed_part(e.trajectory), e.path.name) for e in episodes), *tables]
     if episodes:
         described = dict(episodes[0].description)
     problems = {
@@ -183,7 +185,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
             store_robot(robot, config.out)
             if policy is not None:
                 dataset.keep_policy(policy.path, policy.digest)
-    noted = [{"plausibility": problems, "source": source} for source in sources]
+    # How the run of an episode ended, and what its user decided, goes with it.
+    known = [{} if (entry := entry_of_episode(e.path)) is None else dict(entry.facts) for e in episodes]
+    known += [{} for _ in recordings]
+    noted = [{**of, "plausibility": problems, "source": s} for of, s in zip(known, sources, strict=True)]
     return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
 
 
@@ -201,8 +206,8 @@ def _refuse_copies(folder: Path, sources: Sequence[Mapping[str, Any]], say: Say)
 
     taken: dict[tuple[Any, ...], str] = {}
     kept = Dataset.open(folder, say).episodes if (folder / INDEX_NAME).is_file() else ()
-    for index, episode in enumerate(kept):
-        taken[_content(episode.facts.get("source", {}))] = f"episode {index} of {folder}"
+    for episode in kept:
+        taken[_content(episode.facts.get("source", {}))] = f"episode {episode.number} of {folder}"
     for source in sources:
         if _content(source) in taken:
             raise DatasetError(
@@ -272,7 +277,7 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
 
     Args:
         config: Settings.
-        say: Called with sentences on repairs of the dataset, and on filled samples.
+        say: Called with sentences on repairs of the dataset, on what is left out, and on filled samples.
 
     Returns:
         The number of episodes, and the robot's name.
@@ -281,15 +286,17 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
         DatasetError: It cannot be read, or the folder cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
+    from deal_hw.data.checks.following import followed_part, what_is_cut
     from deal_hw.data.export.lerobot import export_lerobot
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.data.recording.reader import read_trajectory
 
+    paths = [config.path]
     if config.path.is_dir():
         dataset = Dataset.open(dataset_of(config.path), say)
-        paths = [dataset.path(index) for index in range(len(dataset.episodes))]
-    else:
-        paths = [config.path]
+        # To look at a failed run, too, is what Foxglove is for.
+        numbers = dataset.numbers if config.format == "foxglove" else dataset.used(say)
+        paths = [dataset.path(number) for number in numbers]
     if config.format == "foxglove":
         refuse(
             given(config, ExportSettings(path=config.path, out=config.out), ("task",)),
@@ -297,8 +304,18 @@ def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, s
         )
         return len(paths), _with_scene(paths, config.out, say)
     trajectories = [read_trajectory(path) for path in paths]
+    names = [path.name for path in paths]
+    for name, trajectory in zip(names, trajectories, strict=True):
+        if cut := what_is_cut(trajectory):
+            say(f"{name}: {cut}")
     robot = trajectories[0].metadata["description"]["name"] if trajectories else ""
-    frames, filled = export_lerobot(trajectories, config.out, robot, config.task)
+    frames, filled = export_lerobot(
+        [followed_part(trajectory) for trajectory in trajectories],
+        config.out,
+        robot,
+        config.task,
+        names=names,
+    )
     if filled:
         say(f"{filled} of {frames} frames replace lost samples: they are interpolated and marked by `filled`")
     return len(trajectories), robot

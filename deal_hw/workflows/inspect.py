@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Protocol
 
 from deal_hw.calibration import CalibrationResult, percent, read_result
+from deal_hw.data.checks.following import followed_part, what_is_cut
 from deal_hw.data.files import episode_of
 from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription
@@ -59,7 +60,7 @@ class Inspection:
         description: The robot.
         result: The shown calibration, or None.
         overlay: The predictions; None if the recording allows none.
-        note: Why there is no prediction; empty otherwise.
+        note: Why there is no prediction, or why it ends before the recording; empty otherwise.
     """
 
     path: Path
@@ -93,7 +94,7 @@ class Inspection:
             )
             window_s = self.overlay.window_s
             lines.append(f"{name:>10}: position error over {window_s:.2f} s, of the range: {shares}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *filter(None, [self.note])])
 
     def verdict(self) -> str:
         """Return the calibration's verdict as markdown; empty without a calibration."""
@@ -238,10 +239,12 @@ def _overlay(
     latency_s = settings.latency
     if latency_s is None:
         latency_s = 0.0 if result is None else result.latency_s
+    cut = what_is_cut(episode.trajectory)
+    part = followed_part(episode.trajectory)
     try:
         overlay = compute_overlay(
-            episode.trajectory, description, space, sets, latency_s=latency_s, window_s=settings.window
+            part, description, space, sets, latency_s=latency_s, window_s=settings.window
         )
     except InsufficientDataError as err:
-        return None, f"No predictions: {err}."
-    return overlay, ""
+        return None, f"No predictions: {err}{cut and f'; {cut}'}."
+    return overlay, cut and f"Of the predictions {cut}."

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from deal_hw.data.files import episode_of
+from deal_hw.data.recording.dataset_index import entry_of_episode
 from deal_hw.data.recording.reader import read_metadata, read_trajectory
 from deal_hw.errors import DealHwError
 from deal_hw.motions.behaviours import ReplayBehaviour
@@ -197,6 +198,9 @@ def run(config: ReplaySettings | ReplaySimulatedSettings, view: RunView) -> RunR
     path = episode_of(config.episode)
     trajectory = read_trajectory(path)
     robot = config.robot or _robot_of(path, trajectory.metadata)
+    entry = entry_of_episode(path)
+    if entry is not None and entry.failure:
+        view.warn(f"warning: {path} is of a failed run: {entry.failure}; its commands may do that again")
     if isinstance(config, ReplaySimulatedSettings):
         return _rehearse(config, view, robot, path, trajectory)
     behaviour = ReplayBehaviour(trajectory, driver_description(robot))

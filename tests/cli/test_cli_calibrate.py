@@ -22,7 +22,7 @@ from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.errors import ConfigurationError, InsufficientDataError, UnknownNameError
 from deal_hw.motions.behaviours import Behaviour, HoldBehaviour
 from deal_hw.motions.excitation.behaviours import ChirpBehaviour, ChirpConfig, RichBehaviour, RichConfig
-from deal_hw.workflows.calibration.dataset import choose_episodes
+from deal_hw.workflows.calibration.episodes import choose_episodes
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import CalibrateReport
 from deal_hw.workflows.calibration.space import without_speed_limits

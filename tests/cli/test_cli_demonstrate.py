@@ -25,7 +25,7 @@ from deal_hw.errors import InsufficientDataError
 from deal_hw.motions.excitation.level import ExcitationLevelSearch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
-from deal_hw.workflows.calibration.dataset import choose_episodes
+from deal_hw.workflows.calibration.episodes import choose_episodes
 from deal_hw.workflows.calibration.run import calibrate_episodes
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, VirtualEpisode, demonstrate

@@ -78,6 +78,8 @@ LINES = (
     "data info dataset",
     "data verify dataset",
     "data repair dataset",
+    "data keep dataset 0",
+    "data remove dataset 0 --yes",
     "data import fit.csv --out imported",
     "data import fit.csv --out imported --model arm.xml",
     "data import fit.csv --out imported --robot arm.yaml",

@@ -94,6 +94,7 @@ REQUIRED: dict[str, Any] = {
     "policy": Path("p.onnx"),
     "lerobot": Path("l.json"),
     "bus": "feetech",
+    "episodes": (0,),
 }
 
 
@@ -341,8 +342,13 @@ def test_help_explains_common_options_and_names_rare_ones(
     assert 0 < len(options_of(common)) <= 15 and rare
     assert " ".join(end.split()).startswith(f"(explained by deal-hw {line} --help-all): --")
     if robot == "go2" or verb == "calibrate":
-        # A user's robot has no sets of parameters.
-        named = {name.replace("_", "-") for name in VERBS[verb].common} - {"env", "space", "hung-on-crane"}
+        # A user's robot has no sets of parameters, and files are no episodes.
+        named = {name.replace("_", "-") for name in VERBS[verb].common} - {
+            "env",
+            "space",
+            "episodes",
+            "hung-on-crane",
+        }
         assert named <= {option.removeprefix("--") for option in options_of(common)}
 
 

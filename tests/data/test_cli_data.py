@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from deal_hw.cli.data import InfoSettings, Repair, Verify, _position_ranges, data
+from deal_hw.cli.data import InfoSettings, Repair, Verify, data
+from deal_hw.cli.data_info import _position_ranges
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.episode_info import EpisodeInfo
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -93,6 +94,59 @@ def test_info_of_an_episode_shows_checks(
     cart, pole = (line.split() for line in printed.splitlines()[-3:-1])
     # The pole has no motor, so it has no targets.
     assert (cart[:2], len(cart), pole[:2], len(pole)) == (["cart", "m"], 8, ["pole", "rad"], 6)
+
+
+def test_episodes_are_kept_and_removed(
+    dataset: Path,
+    write_episode: WriteEpisode,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As a person does it after a trip: look, keep, remove after a question, put back; files stay."""
+    from deal_hw.cli.main import main
+
+    monkeypatch.setenv("COLUMNS", "80")
+    with Dataset.create_or_open(dataset, DESCRIPTION) as collection:
+        path = collection.next_episode_path()
+        shutil.copy(write_episode("tripped.mcap"), path)
+        collection.note_episode(path, {"motion": "rich", "outcome": "tripped", "reason": "too fast"})
+
+    def printed(line: str, code: int = 0) -> str:
+        assert main(["data", *line.split()]) == code
+        output = capsys.readouterr()
+        return " ".join((output.err + output.out).split())
+
+    shown = printed(f"info {dataset}")
+    assert "left out" in shown and f"deal-hw data keep {dataset} 1" in shown
+    assert "left out: the safety module ended it (too fast)" in printed(
+        f"info {dataset}/episodes/000001.mcap"
+    )
+    assert printed(f"keep {dataset} 1") == "episode 1 is used although the safety module ended it (too fast)"
+    assert "episode 1 is kept: the safety module ended it (too fast)" in printed(f"info {dataset}")
+    assert "nobody can answer here; add --yes" in printed(f"remove {dataset} 1", 2)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: "n")
+    asked = printed(f"remove {dataset} 1", 1)
+    assert "episode 1: test rich, 3.0 s, the safety module ended it" in asked
+    assert asked.endswith("nothing was removed") and Dataset.open(dataset).numbers == (0, 1)
+    monkeypatch.setattr("builtins.input", lambda question: "y")
+    assert f"to put back: deal-hw data keep {dataset} 1" in printed(f"remove {dataset} 1")
+    assert Dataset.open(dataset).numbers == (0,)
+    document = json.loads(printed(f"info {dataset} --json"))
+    assert document["removed"] == [1] and [one["number"] for one in document["episodes"]] == [0]
+    assert f"removed: 1, to {dataset}/removed" in printed(f"info {dataset}")
+    assert "episode 1 is put back, and used" in printed(f"keep {dataset} 1")
+    printed(f"remove {dataset} 0 1 --yes")
+    assert Dataset.open(dataset).numbers == () and len(list((dataset / "removed").iterdir())) == 4
+
+
+def test_info_of_a_file_with_any_name(
+    write_episode: WriteEpisode, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A copy elsewhere has no number and no index."""
+    assert data(InfoSettings(path=write_episode("copy.mcap"), json=True)) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert (shown["number"], shown["left_out"], shown["file"]) == (-1, "", "episodes/copy.mcap")
 
 
 def test_verify_then_repair(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import deal_hw
 from deal_hw.cli.main import EXIT_ERROR, EXIT_OK, main
 from deal_hw.control.process.channel import Outcome
+from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.data.recording.recorder import EpisodeRecorder
 from deal_hw.errors import ConfigurationError, DatasetError
@@ -178,7 +180,13 @@ def test_a_rehearsal_without_a_robot(noisy: Path, tmp_path: Path, capsys: pytest
     dataset = tmp_path / "run" / "dataset"
     line = ["collect", str(dataset), "--simulated", "--out", str(tmp_path / "again"), "--seconds", "3"]
     assert main([*line, "--truth-seed", "2", "--motion", "chirp"]) == EXIT_OK
-    assert f"next: deal-hw calibrate {tmp_path / 'again' / 'dataset'}\n" in capsys.readouterr().out
+    # A sweep alone is held out, so that nothing is left to fit.
+    recorded = tmp_path / "again" / "dataset"
+    printed = capsys.readouterr().out
+    assert "not enough for a calibration: nothing to fit" in printed and "next:" not in printed
+    assert f"deal-hw calibrate {recorded} --episodes 0\n" in printed
+    assert main([*line, "--truth-seed", "2"]) == EXIT_OK
+    assert f"next: deal-hw calibrate {recorded}\n" in capsys.readouterr().out
     again = tmp_path / "again" / "dataset" / "episodes" / "000000.mcap"
     one, two = (deal_hw.inspect(path).episode.trajectory for path in (report.paths[0], again))
     assert (one.position == two.position).all()
@@ -186,6 +194,20 @@ def test_a_rehearsal_without_a_robot(noisy: Path, tmp_path: Path, capsys: pytest
     repeated = deal_hw.inspect(replayed.paths[0]).episode.trajectory
     assert (repeated.requested_position[:100] == two.requested_position[:100]).all()
     assert deal_hw.design_excitation(str(dataset), out=tmp_path / "e.json", family="steps").path.is_file()
+
+
+def test_a_simulated_trip_advises_as_a_real_one(noisy: Path, tmp_path: Path) -> None:
+    """A joint that is too fast asks for a gentler motion; the episode keeps the flag."""
+    text = re.sub(r"velocity_limit: [\w.]+", "velocity_limit: 0.1", noisy.read_text(encoding="utf-8"))
+    noisy.write_text(text, encoding="utf-8")
+    output: list[str] = []
+    simulation = deal_hw.SimulationOptions(simulated=True)
+    report = deal_hw.collect(str(noisy), simulation=simulation, out=tmp_path / "run", say=output.append)
+    assert report.outcome is Outcome.TRIPPED and report.episodes[0].flags == ("velocity",)
+    assert any("record again with --excitation-level -1" in text for text in output)
+    assert "  calibrate leaves this episode out" in output
+    (episode,) = Dataset.open(tmp_path / "run" / "dataset").episodes
+    assert episode.left_out.startswith("the safety module ended it (joint 'pivot' moves at")
 
 
 REFUSED: list[tuple[str, str]] = [

@@ -87,11 +87,23 @@ def test_warnings_reach_the_operator_of_a_silent_program(capsys: pytest.CaptureF
     assert dataclasses.replace(lost, outcome=Outcome.FAILED).lines() == ["failed"]
     kept = dataclasses.replace(lost, path=Path("000003.mcap"))
     assert kept.lines()[-1].startswith("  to see why: deal-hw inspect 000003.mcap (docs/troubleshooting.md)")
+    assert kept.lines()[-2] == "  calibrate leaves this episode out"
 
 
-@pytest.mark.parametrize("confirmed", [True, False])
-def test_a_lost_connection_asks_for_no_gentler_motion(confirmed: bool) -> None:
-    """A robot that was made passive ended for its motion; one that could not be, for its cable."""
+@pytest.mark.parametrize(
+    ("flag", "confirmed", "gentler"),
+    [
+        ("position", True, True),
+        ("velocity", True, True),
+        ("position", False, False),
+        ("state_stale", True, False),
+        ("action_late", True, False),
+        ("transport_errors", True, False),
+        ("operator_stop", True, False),
+    ],
+)
+def test_a_gentler_motion_is_advised_where_it_can_help(flag: str, confirmed: bool, gentler: bool) -> None:
+    """Not after a lost connection, on a busy computer, or for an operator who pressed a button."""
     search = ExcitationLevelSearch(0.0, 4, rearm=False)
     plan = RunPlan(robot="cartpole", motion="rich", policy="", seconds=4.0, seed=0)
     moved = Excitation(4.0, (0.4, 4.0), (2.0, 8.0), (1.0, 3.0), (9, 9), (0.4,), (40,))
@@ -101,9 +113,10 @@ def test_a_lost_connection_asks_for_no_gentler_motion(confirmed: bool) -> None:
         reason="joint 'cart' is at 0.39 m",
         passive_confirmed=confirmed,
         motion=moved,
+        flags=(flag,),
     )
     assert not supervised._to_repeat(search, plan, ended, DESCRIPTION)
-    assert ("--excitation-level -1" in search.words) is confirmed
+    assert ("--excitation-level -1" in search.words) is gentler
 
 
 def test_a_policy_for_another_robot_is_refused_before_the_port(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from deal_hw.data.checks import samples, telemetry
 from deal_hw.data.checks.blind import BlindRange, check_blind, find_blind, without_blind
+from deal_hw.data.checks.following import check_following, followed_part
 from deal_hw.data.checks.samples import OTHERS, OURS
 from deal_hw.data.checks.spikes import (
     DEFAULT_SPIKES,
@@ -37,14 +38,18 @@ def check(
 ) -> tuple[Finding, ...]:
     """Run all checks on an episode of our recorder; the order is fixed.
 
+    They look at the part in which the joints followed their commands; the last one says where that ends.
+
     Args:
         trajectory: The recording.
         spikes: Definition of a spike.
         blind: Blind ranges of the robot's sensors; None: those that this recording shows.
     """
+    following, trajectory = check_following(trajectory), followed_part(trajectory)
     if trajectory.device_s.size < samples.FEWEST:
         text = f"{trajectory.device_s.size} state samples"
-        return (Finding("length", Severity.FAIL, text, f"record at least {samples.SHORTEST_S:g} s"),)
+        few = Finding("length", Severity.FAIL, text, f"record at least {samples.SHORTEST_S:g} s")
+        return (few, following)
     table = table_of(trajectory)
     if table.effort is None and "import" not in trajectory.metadata:
         # Only the file of an import may have no effort at all.
@@ -66,6 +71,7 @@ def check(
         telemetry.check_safety_filter(trajectory),
         telemetry.check_stops(trajectory),
         telemetry.check_hand_over(trajectory),
+        following,
     )
 
 

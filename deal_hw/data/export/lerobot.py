@@ -42,6 +42,7 @@ def export_lerobot(
     robot_type: str = "",
     task: str = "deal-hw",
     most_filled: float = 0.5,
+    names: Sequence[str] = (),
 ) -> tuple[int, int]:
     """Write a LeRobot dataset, one episode per recording; return its numbers of frames and of filled ones.
 
@@ -60,6 +61,7 @@ def export_lerobot(
         robot_type: Goes into ``info.json``.
         task: Description of the robot's task.
         most_filled: A recording with a larger share of filled frames is refused.
+        names: Names of the recordings in messages; by default recording 0, recording 1, ...
 
     Raises:
         MissingExtraError: pyarrow is not installed.
@@ -78,7 +80,8 @@ def export_lerobot(
     first = trajectories[0]
     if any((t.joint_names, t.actuated) != (first.joint_names, first.actuated) for t in trajectories):
         raise DatasetError("the recordings have different joints; export those of one robot at a time")
-    tables = [table_of(trajectory, f"recording {number}") for number, trajectory in enumerate(trajectories)]
+    names = names or [f"recording {number}" for number in range(len(trajectories))]
+    tables = [table_of(trajectory, name) for trajectory, name in zip(trajectories, names, strict=True)]
     period = common_period(tables)
     episodes = []
     for table in tables:

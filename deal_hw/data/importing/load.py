@@ -41,15 +41,19 @@ SAME_EFFORT = 0.02
 """A motor of 1 N or N·m, within this, takes both kinds of command alike [N or N·m]."""
 
 
-def read_channels(path: Path) -> list[Channels]:
+def read_channels(path: Path, say: Say | None = None) -> list[Channels]:
     """Read a file, a LeRobot folder, our own dataset or the folder of a ROS 2 bag; one entry per recording.
+
+    Args:
+        path: The file or folder.
+        say: Called with a sentence on each episode of our own dataset that is left out.
 
     Raises:
         DatasetError: There is no such file, or its kind is unknown.
     """
     path = Path(path)
     if path.is_dir():
-        return _read_folder(path)
+        return _read_folder(path, say)
     if not path.exists():
         raise DatasetError(f"{path} does not exist; check its name")
     if is_episode(path):
@@ -64,16 +68,13 @@ def read_channels(path: Path) -> list[Channels]:
     return [getattr(importlib.import_module(module), function)(path)]
 
 
-def _read_folder(path: Path) -> list[Channels]:
+def _read_folder(path: Path, say: Say | None) -> list[Channels]:
     from deal_hw.data.importing.lerobot_source import is_lerobot, read_lerobot
 
     if is_lerobot(path):
         return read_lerobot(path)
     if is_dataset(path):
-        from deal_hw.data.recording.dataset import Dataset
-
-        dataset = Dataset.open(path, lambda text: None)
-        return [read_own(dataset.path(index)) for index in range(len(dataset.episodes))]
+        return [read_own(episode) for episode in own_episodes(path, say)]
     if (path / "metadata.yaml").is_file():
         from deal_hw.data.importing.bag_source import bag_files, read_bag
 
@@ -110,7 +111,7 @@ def load_tables(
     """
     described = f"{page('how-to/import.md')} describes one"
     with reading(path, "a recording of a robot", described):
-        tables = tables_of(read_channels(path), columns, joints, say, printed, kinds)
+        tables = tables_of(read_channels(path, say), columns, joints, say, printed, kinds)
     if not tables:
         raise DatasetError(f"{path} holds no recording")
     return tables
@@ -181,16 +182,20 @@ def _tell_turns(say: Say, table: Table) -> None:
 
 
 def own_episodes(path: Path, say: Say | None = None) -> list[Path]:
-    """Return the episodes of our own dataset, or the named one; none of any other file.
+    """Return the used episodes of our own dataset, or the named one; none of any other file.
+
+    Args:
+        path: The file or folder.
+        say: Called with a sentence on each repair, and on each episode that is left out.
 
     Raises:
-        DatasetError: The dataset cannot be read.
+        DatasetError: The dataset cannot be read, or all of its episodes are left out.
     """
     if is_dataset(path):
         from deal_hw.data.recording.dataset import Dataset
 
         dataset = Dataset.open(path, say or (lambda text: None))
-        return [dataset.path(index) for index in range(len(dataset.episodes))]
+        return [dataset.path(number) for number in dataset.used(say or (lambda text: None))]
     return [path] if is_episode(path) else []
 
 
@@ -277,13 +282,18 @@ def _tell(
 def read_own(path: Path) -> Channels:
     """Read an episode: samples on device time, commands at the device time of their start.
 
+    What comes after joints no longer followed their commands is left out.
+
     Raises:
         TornRecordingError: It has no footer or is damaged.
         DatasetError: It cannot be read.
     """
+    from deal_hw.data.checks.following import followed_part, what_is_cut
     from deal_hw.data.recording.reader import read_trajectory
 
-    table = table_of(read_trajectory(path), path.name)
+    trajectory = read_trajectory(path)
+    cut = what_is_cut(trajectory)
+    table = table_of(followed_part(trajectory), path.name)
     arrays = {
         "time_s": table.time_s,
         "position": table.position,
@@ -302,6 +312,7 @@ def read_own(path: Path) -> Channels:
         labels={name: joints for name, joints in measured.items() if name in arrays}
         | {"target": table.actuated},
         units={"position": table.units},
+        notes=(cut,) if cut else (),
     )
 
 

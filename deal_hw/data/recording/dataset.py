@@ -7,58 +7,31 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar
+from typing import Any
 
 from typing_extensions import Self
 
-from deal_hw.data.files import INDEX_NAME, write_bytes, write_json
-from deal_hw.data.recording.episode_info import EpisodeInfo, summarize
-from deal_hw.data.recording.reader import Episode, check_description, read_episode
+from deal_hw.data.files import INDEX_NAME, write_bytes
+from deal_hw.data.recording.dataset_index import read_index, write_index
+from deal_hw.data.recording.episode_info import EXAMPLE, EpisodeInfo, number_in, summarize
+from deal_hw.data.recording.reader import Episode, read_episode
 from deal_hw.description import RobotDescription, digest_of
-from deal_hw.errors import ConfigurationError, DatasetError, EmptyRecordingError
-from deal_hw.reading import MIB, read_json
-from deal_hw.schema import STRICT
+from deal_hw.errors import DatasetError, EmptyRecordingError
 
-SCHEMA_VERSION = 1
 POLICY_FOLDER = "policies"
-_WHAT = "the index of a dataset"
-_INDEX_BYTES = 64 * MIB
-"""Largest index [B]; that of 10,000 episodes has some 30 MB."""
+REMOVED_FOLDER = "removed"
+"""Folder of removed episodes; see :mod:`deal_hw.data.recording.removal`."""
 _LOCK_NAME = ".lock"
+_SHOWN = 5
+"""Most episodes that one message lists."""
 Notify = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True)
-class _Version:
-    """The part of an index that every version of deal-hw writes."""
-
-    schema_version: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Index:
-    """``dataset.json``."""
-
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = STRICT
-
-    schema_version: int
-    robot: str
-    digest: str
-    description: Mapping[str, Any]
-    episodes: tuple[EpisodeInfo, ...]
-
-    def __post_init__(self) -> None:
-        check_description(self.description)
-        if self.digest != digest_of(self.description):
-            raise ConfigurationError("the index was edited: its digest is not that of its description")
-
-
 class Dataset:
-    """A folder of episodes; made by :meth:`create_or_open` or :meth:`open`.
+    """A folder of episodes; made by :meth:`create_or_open`, :meth:`open` or :meth:`edit`.
 
     A collector closes it or uses it in a ``with`` block; until then no other collector can append to it.
 
@@ -66,7 +39,8 @@ class Dataset:
         folder: Where it is.
         description: ``RobotDescription.to_json()`` of its robot.
         digest: Digest of the description.
-        episodes: Entry of the index for each episode, in order.
+        episodes: Entry of the index for each episode, in order. Its place there is not its number where
+            episodes were removed.
     """
 
     def __init__(
@@ -83,7 +57,7 @@ class Dataset:
         self.episodes = episodes
         self._lock = lock
         self._notify = notify
-        self._next = len(episodes)
+        self._next = 0
 
     @classmethod
     def create_or_open(
@@ -107,21 +81,14 @@ class Dataset:
             lock = _lock(folder)
         except OSError as error:
             raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
-        if lock < 0:
-            raise DatasetError(
-                f"dataset {folder} is in use by another collector; wait for it or name another folder"
-            )
-        try:
+        with _released_on_error(folder, lock):
             if (folder / INDEX_NAME).exists():
                 dataset = cls._load(folder, lock, notify)
                 _refuse_other(folder, dataset.description, facts)
             else:
                 dataset = cls(folder, facts, (), lock, notify)
-                dataset._save()
+                write_index(folder, facts, ())
             dataset._adopt()
-        except BaseException:
-            os.close(lock)
-            raise
         return dataset
 
     @classmethod
@@ -135,12 +102,7 @@ class Dataset:
         Raises:
             DatasetError: It is not a dataset or cannot be read.
         """
-        folder = Path(folder)
-        if not (folder / INDEX_NAME).is_file():
-            raise DatasetError(
-                f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, and "
-                "`deal-hw data import` makes one from files"
-            )
+        folder = _existing(folder)
         try:
             lock = _lock(folder)
         except OSError:
@@ -156,33 +118,96 @@ class Dataset:
         return dataset
 
     @classmethod
+    def edit(cls, folder: Path, notify: Notify = print) -> Self:
+        """Open a dataset to keep or remove episodes; it is locked until closed.
+
+        Args:
+            folder: The dataset.
+            notify: Called with a sentence for each repair.
+
+        Raises:
+            DatasetError: It is not a dataset, a collector has it open, or it cannot be read or written.
+        """
+        folder = _existing(folder)
+        try:
+            lock = _lock(folder)
+        except OSError as error:
+            raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
+        with _released_on_error(folder, lock):
+            dataset = cls._load(folder, lock, notify)
+            dataset._adopt()
+        return dataset
+
+    @classmethod
     def _load(cls, folder: Path, lock: int, notify: Notify) -> Self:
-        path = folder / INDEX_NAME
-        version = read_json(path, _Version, _WHAT, most=_INDEX_BYTES).schema_version
-        if version != SCHEMA_VERSION:
-            raise DatasetError(
-                f"{path} has schema version {version}, expected {SCHEMA_VERSION}; "
-                "it was written by another version of deal-hw"
-            )
-        index = read_json(path, _Index, _WHAT, most=_INDEX_BYTES)
+        index = read_index(folder)
         return cls(folder, index.description, index.episodes, lock, notify)
 
-    def path(self, index: int) -> Path:
-        """Return the file of an episode; negative numbers count from the end.
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The episodes' numbers, in order; a removed episode leaves a gap."""
+        return tuple(episode.number for episode in self.episodes)
+
+    def info(self, number: int) -> EpisodeInfo:
+        """Return the index's entry for an episode; negative numbers count from the end.
 
         Raises:
             DatasetError: There is no such episode.
         """
-        if not -len(self.episodes) <= index < len(self.episodes):
+        found = [episode for episode in self.episodes if episode.number == number]
+        if not found and -len(self.episodes) <= number < 0:
+            found = [self.episodes[number]]
+        if not found:
+            last = f", the last is {self.numbers[-1]}" if self.episodes else ""
             raise DatasetError(
-                f"dataset {self.folder} has {len(self.episodes)} episodes; there is no number {index} (the "
-                "first is 0)"
+                f"dataset {self.folder} has {len(self.episodes)} episodes; there is no number {number} (the "
+                f"first is {self.numbers[0] if self.episodes else 0}{last})"
             )
-        return self.folder / self.episodes[index].file
+        return found[0]
 
-    def read(self, index: int) -> Episode:
+    def path(self, number: int) -> Path:
+        """Return the file of an episode; numbers and errors as :meth:`info`."""
+        return self.folder / self.info(number).file
+
+    def read(self, number: int) -> Episode:
         """Read an episode; errors as :func:`~deal_hw.data.recording.reader.read_episode` and :meth:`path`."""
-        return read_episode(self.path(index))
+        return read_episode(self.path(number))
+
+    def why_left_out(self, info: EpisodeInfo) -> str:
+        """Return why an episode is left out, and how to use it all the same, as text; "" if it is used."""
+        if not info.left_out:
+            return ""
+        text = f"episode {info.number} is left out: {info.left_out}"
+        if info.failed_checks:
+            return f"{text}; also {'; '.join(info.failed_checks)}"
+        return f"{text}; to use it all the same: deal-hw data keep {self.folder} {info.number}"
+
+    def used(self, notify: Notify) -> tuple[int, ...]:
+        """Return the numbers of the episodes that are used.
+
+        Args:
+            notify: Called with a sentence for each that is left out.
+
+        Raises:
+            DatasetError: All are left out.
+        """
+        left_out = [text for info in self.episodes if (text := self.why_left_out(info))]
+        if left_out and len(left_out) == len(self.episodes):
+            more = f". {len(left_out) - _SHOWN} more" if len(left_out) > _SHOWN else ""
+            raise DatasetError(f"dataset {self.folder}: {'. '.join(left_out[:_SHOWN])}{more}")
+        for text in left_out:
+            notify(text)
+        return tuple(info.number for info in self.episodes if not info.left_out)
+
+    def change(self, episodes: Sequence[EpisodeInfo]) -> None:
+        """Write another list of episodes to the index.
+
+        Raises:
+            DatasetError: The dataset was not opened for changes, or cannot be written.
+        """
+        self._require_lock()
+        self.episodes = tuple(sorted(episodes, key=lambda episode: episode.number))
+        write_index(self.folder, self.description, self.episodes)
 
     def policy_path(self, digest: str) -> Path:
         """Return the path of a kept policy; ``digest`` is its file's SHA-256 or the first 16 digits of it."""
@@ -236,11 +261,12 @@ class Dataset:
         """
         self._require_lock()
         file = f"episodes/{Path(path).name}"
-        if Path(path).resolve() != (self.folder / file).resolve():
-            raise DatasetError(f"{path} is not in {self.folder / 'episodes'}")
+        if Path(path).resolve() != (self.folder / file).resolve() or number_in(file) < 0:
+            raise DatasetError(
+                f"{path} is not in {self.folder / 'episodes'}, or has no name such as {EXAMPLE}"
+            )
         info, episode = self._take(file, "", facts)
-        self.episodes = (*self.episodes, info)
-        self._save()
+        self.change((*self.episodes, info))
         return info, episode
 
     def close(self) -> None:
@@ -265,10 +291,12 @@ class Dataset:
     def _adopt(self) -> None:
         """Add recordings that the index does not name, because their collector was killed."""
         known = {episode.file for episode in self.episodes}
-        found = sorted((self.folder / "episodes").glob("[0-9]*.mcap"))
-        strays = [f"episodes/{path.name}" for path in found if f"episodes/{path.name}" not in known]
+        found = [f"episodes/{path.name}" for path in sorted((self.folder / "episodes").glob("[0-9]*.mcap"))]
+        strays = [file for file in found if file not in known]
         for file in strays:
             try:
+                if number_in(file) < 0:
+                    raise DatasetError(f"it has no name such as {EXAMPLE}; rename it")
                 info, _ = self._take(file, "added to the index after its collector was killed")
             except DatasetError as error:
                 self._notify(f"{self.folder / file} is left out: {error}")
@@ -276,29 +304,16 @@ class Dataset:
             self._notify(
                 f"{self.folder / file} was not in the index; it was added, with {info.states} state samples"
             )
-            self.episodes = (*self.episodes, info)
-        if strays:
-            self._save()
-        numbers = [int(path.stem) for path in found if path.stem.isdigit()]
-        self._next = max([len(self.episodes), *(number + 1 for number in numbers)])
-
-    def _save(self) -> None:
-        values = {
-            "schema_version": SCHEMA_VERSION,
-            "robot": self.description["name"],
-            "digest": self.digest,
-            "description": self.description,
-            "episodes": [asdict(episode) for episode in self.episodes],
-        }
-        try:
-            write_json(self.folder / INDEX_NAME, values)
-        except OSError as error:
-            raise DatasetError(f"{self.folder / INDEX_NAME} cannot be written: {error.strerror}") from error
+            self.change((*self.episodes, info))
+        removed = [f"episodes/{path.name}" for path in (self.folder / REMOVED_FOLDER).glob("*.mcap")]
+        # A number is never used twice, or results would name another episode than the one they are from.
+        self._next = max([-1, *map(number_in, (*found, *removed)), *self.numbers]) + 1
 
     def _require_lock(self) -> None:
         if self._lock < 0:
             raise DatasetError(
-                f"dataset {self.folder} is open for reading only; a collector uses Dataset.create_or_open"
+                f"dataset {self.folder} is open for reading only; a collector uses Dataset.create_or_open, "
+                "a change of its episodes Dataset.edit"
             )
 
     def __enter__(self) -> Self:
@@ -308,6 +323,39 @@ class Dataset:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _existing(folder: Path) -> Path:
+    """Return the folder of a dataset that is there.
+
+    Raises:
+        DatasetError: It is not a dataset.
+    """
+    folder = Path(folder)
+    if not (folder / INDEX_NAME).is_file():
+        raise DatasetError(
+            f"{folder} is not a dataset: it has no {INDEX_NAME}; `deal-hw collect` makes one, and "
+            "`deal-hw data import` makes one from files"
+        )
+    return folder
+
+
+@contextlib.contextmanager
+def _released_on_error(folder: Path, lock: int) -> Iterator[None]:
+    """Release the lock of a dataset if the block raises.
+
+    Raises:
+        DatasetError: Another process holds the lock.
+    """
+    if lock < 0:
+        raise DatasetError(
+            f"dataset {folder} is in use by another collector; wait for it or name another folder"
+        )
+    try:
+        yield
+    except BaseException:
+        os.close(lock)
+        raise
 
 
 def _lock(folder: Path) -> int:

@@ -1,7 +1,8 @@
-"""The entry of a dataset's index for one episode."""
+"""The entry of a dataset's index for one episode, and whether the episode is used."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,10 +12,17 @@ from deal_hw.data.checks.clock_sync import synchronize
 from deal_hw.data.checks.suite import check
 from deal_hw.data.recording.excitation import excitation
 from deal_hw.data.recording.reader import Episode, read_episode
-from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, shown
+from deal_hw.errors import ConfigurationError, EmptyRecordingError, InsufficientDataError, short, shown
 from deal_hw.findings import Finding, Severity
 from deal_hw.schema import STRICT
 
+KEPT = "kept"
+"""Fact of an episode that the user wants to use although its run failed."""
+_FAILED = {"tripped": "the safety module ended it", "failed": "its run failed"}
+"""Outcomes of runs whose recordings are left out, in words."""
+EXAMPLE = "episodes/000007.mcap"
+"""A name of an episode's file in its dataset, for messages."""
+_FILE = re.compile(r"episodes/(\d{6,9})\.mcap", re.ASCII)
 _MOST_JUMPS = 20
 """Largest number of clock jumps in an entry; a recording with very many must not fill the index."""
 _VERDICT = {"name", "severity", "message"}
@@ -39,7 +47,7 @@ class EpisodeInfo:
         clock: Relation of the clocks, as ``clock_sync.ClockSync.to_json`` writes it, with 20 jumps at most;
             None if unknown.
         note: A note for the operator, such as on a repair.
-        facts: Values that the collector adds: outcome, loop_timing, task, ...
+        facts: Values that the collector adds: outcome, loop_timing, task, ...; and :data:`KEPT`.
 
     Raises:
         ConfigurationError: The file is outside the dataset, a verdict is invalid, or the clock's numbers are
@@ -78,6 +86,39 @@ class EpisodeInfo:
         for value in excitation.values():
             if not all(_is_number(part) for part in (value if isinstance(value, list | tuple) else [value])):
                 raise ConfigurationError(f"field excitation holds {shown(value)}; wanted: numbers")
+
+    @property
+    def number(self) -> int:
+        """The episode's number, that of its file; it stays when other episodes are removed. -1: none."""
+        return number_in(self.file)
+
+    @property
+    def failure(self) -> str:
+        """Why its run failed, as text; "" if it did not."""
+        how = _FAILED.get(str(self.facts.get("outcome")), "")
+        return how and f"{how} ({short(self.facts.get('reason') or 'for an unknown reason')})"
+
+    @property
+    def left_out(self) -> str:
+        """Why nothing uses it unless it is named; "" if it is used.
+
+        This is the mark of an episode. Nothing else decides it, so that datasets of any age behave alike.
+        """
+        if not self.states:
+            return "it holds no state sample"
+        return "" if self.facts.get(KEPT) is True else self.failure
+
+    @property
+    def failed_checks(self) -> tuple[str, ...]:
+        """The messages of its failed checks: it cannot be calibrated, even if it is named."""
+        return tuple(verdict["message"] for verdict in self.verdicts if verdict["severity"] == Severity.FAIL)
+
+
+def number_in(file: str) -> int:
+    """Return the number of an episode from its file in the dataset; -1 if that has no such name."""
+    found = _FILE.fullmatch(file)
+    # One number has one name: 000001, not 0000001.
+    return int(found[1]) if found and found[1] == f"{int(found[1]):06d}" else -1
 
 
 def _is_number(value: object) -> bool:

@@ -7,11 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.data.checks.following import followed_part
 from deal_hw.schema import plain
 from deal_hw.types import Trajectory
 
 SHORTEST_S = 1.0
-"""Shortest recording that can be calibrated [s]."""
+"""Least time of usable samples, over all recordings, that can be calibrated [s]."""
+LEAST_MOTION = 20.0
+"""Least motion of a joint [multiples of its sensor's noise]."""
+FEWEST_CHANGES = 5
+"""Fewest changes of the target."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +48,11 @@ class Excitation:
 
 
 def excitation(trajectory: Trajectory) -> Excitation:
-    """Return how much the robot moves in a recording; values that are not finite are left out."""
+    """Return how much the robot moves in a recording, up to where its joints no longer follow their commands.
+
+    Values that are not finite are left out.
+    """
+    trajectory = followed_part(trajectory)
     velocity = np.where(np.isfinite(trajectory.velocity), trajectory.velocity, 0.0)
     targets = trajectory.position_target
     return Excitation(

@@ -42,7 +42,7 @@ from deal_hw.data.recording.schemas import (
     message_type,
 )
 from deal_hw.errors import DatasetError
-from deal_hw.types import JointCommand, RobotState
+from deal_hw.types import NOT_FOLLOWING, JointCommand, RobotState
 from deal_hw.version import __version__
 
 FLUSH_INTERVAL_S = 0.05
@@ -51,7 +51,7 @@ may be late by the other half."""
 FORMAT_VERSION = 2
 """Since 2 log times are on the wall clock and standard messages are written; both versions read alike."""
 END_NAME = "deal-hw.end"
-LOG_LEVELS = {"velocity": 1, "clipped": 3, "warning": 3}
+LOG_LEVELS = {"velocity": 1, "clipped": 3, "warning": 3, NOT_FOLLOWING: 3}
 """Level of foxglove.Log by an event's kind: 1 debug, 3 warning; others 2, info."""
 LIBRARY = f"deal-hw/{__version__}"
 _state_of = operator.attrgetter(*(name for _, name in STATE.fields))

@@ -35,7 +35,9 @@ def replay_error(recorded: Trajectory, replayed: Trajectory, before_s: float = 0
     Returns:
         None if the two have fewer than two samples in common.
     """
-    if not recorded.sent_s.size or not replayed.sent_s.size:
+    if not all(
+        one.size for one in (recorded.sent_s, replayed.sent_s, recorded.receive_s, replayed.receive_s)
+    ):
         return None
     before, after = (
         recorded.receive_s - recorded.sent_s[0],

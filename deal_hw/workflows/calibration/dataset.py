@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.data.checks.spikes import SpikeSettings
-from deal_hw.data.recording.episode_info import motion_of
-from deal_hw.data.recording.reader import read_metadata
 from deal_hw.description import RobotDescription
-from deal_hw.errors import ConfigurationError, InsufficientDataError
+from deal_hw.errors import InsufficientDataError
 from deal_hw.types import Trajectory
+from deal_hw.workflows.calibration.episodes import choose_episodes, remaining
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
@@ -27,13 +26,14 @@ from deal_hw.workflows.calibration.space import (
     without_speed_limits,
 )
 from deal_hw.workflows.robot import recorded_robot
-from deal_hw.workflows.say import Say, silent
+from deal_hw.workflows.say import Say
 from deal_hw.workflows.shipped import shipped_balancer
 
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
 
-HELDOUT_MOTION = "chirp"
+_REPORTED = ("spikes", "blind", "following")
+"""Checks whose warnings say that samples are left out."""
 SAMPLES_A_PERIOD = 4
 """Fitted states per control period."""
 
@@ -59,6 +59,14 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
         space = extended(space, Path(settings.parameters), robot)
     space = settings.searched(space)
     episodes = {i: dataset.read(i) for i in (*fit, *held)}
+    trajectories, telemetry = sound_recordings(
+        {i: episode.trajectory for i, episode in episodes.items()},
+        dataset.folder,
+        settings.spikes,
+        say,
+        (*settings.episodes, *settings.holdout),
+    )
+    fit, held = remaining(dataset, fit, held, trajectories)
     policy = None
     if settings.in_closed_loop:
         from deal_hw.workflows.calibration.policy import recorded_policy, say_other_range
@@ -66,9 +74,6 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
         given = None if settings.policy is None else Path(settings.policy)
         policy = recorded_policy(dataset, {i: episodes[i].metadata for i in fit}, description, given)
         say_other_range(policy, robot_name, space, say)
-    trajectories, telemetry = sound_recordings(
-        {i: episode.trajectory for i, episode in episodes.items()}, dataset.folder, settings.spikes, say
-    )
     return Source(
         robot=robot,
         space=without_speed_limits(space, description, trajectories.values(), say),
@@ -77,7 +82,7 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
         division=None,
         sample_hz=settings.sample_hz or SAMPLES_A_PERIOD * description.control_rate_hz,
         feet=description.feet,
-        telemetry=telemetry,
+        telemetry=[*_left_out(dataset, fit, held), *telemetry],
         provenance=_provenance(dataset, fit) | {"holdout": list(held)},
         advice=f"add one: deal-hw collect {robot_name} --port PORT --motion chirp --dataset {dataset.folder}",
         balance=shipped_balancer(description),
@@ -115,7 +120,9 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
         from deal_hw.workflows.calibration.policy_commands import with_policy_clock
 
         trajectories = with_policy_clock(trajectories, policy, joint_facts(description.mjcf, model), say)
-    trajectories, telemetry = sound_recordings(trajectories, dataset.folder, settings.spikes, say)
+    named = (*settings.episodes, *settings.holdout)
+    trajectories, telemetry = sound_recordings(trajectories, dataset.folder, settings.spikes, say, named)
+    fit, held = remaining(dataset, fit, held, trajectories)
     space = searched_space(settings, model, say)
     timestep = float(model.opt.timestep) if settings.physics_step is None else settings.physics_step
     rates = sampling(1.0 / description.state_rate_hz, timestep, settings.window)
@@ -139,7 +146,7 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
         division=division,
         sample_hz=settings.sample_hz,
         feet=description.feet,
-        telemetry=telemetry,
+        telemetry=[*_left_out(dataset, fit, held), *telemetry],
         provenance={
             **_provenance(dataset, fit),
             "holdout": list(held) or f"last {division.share:.0%} of each recording",
@@ -165,83 +172,62 @@ def _provenance(dataset: Dataset, fit: Sequence[int]) -> dict[str, Any]:
     }
 
 
+def _left_out(dataset: Dataset, fit: Sequence[int], held: Sequence[int]) -> list[str]:
+    """Return a line for each episode that is neither fitted nor held out because its run failed."""
+    return [
+        f"episode {info.number}: left out: {info.left_out}"
+        for info in dataset.episodes
+        if info.left_out and info.number not in (*fit, *held)
+    ]
+
+
 def sound_recordings(
-    trajectories: Mapping[int, Trajectory], folder: Path, spikes: SpikeSettings, say: Say
+    trajectories: Mapping[int, Trajectory],
+    folder: Path,
+    spikes: SpikeSettings,
+    say: Say,
+    named: Collection[int] = (),
 ) -> tuple[dict[int, Trajectory], list[str]]:
-    """Check episodes of a dataset; leave out spikes, and values that a sensor holds where it is blind.
+    """Check episodes of a dataset, and leave out the samples that must not be fitted.
+
+    These are spikes, values that a sensor holds where it is blind, and all after joints no longer followed
+    their commands.
 
     Args:
         trajectories: By number.
         folder: The dataset, for messages.
         spikes: Definition of a spike.
-        say: Called with a sentence on each spike and each blind range.
+        say: Called with a sentence on each spike, each blind range, each end of following and each episode
+            that cannot be used.
+        named: The episodes that the user named: one of them that cannot be used is an error.
 
     Returns:
-        The episodes without these samples, by number, and the checks' findings in words.
+        The usable episodes without these samples, by number, and the checks' findings in words.
 
     Raises:
-        InsufficientDataError: An episode cannot be used.
+        InsufficientDataError: A named episode cannot be used.
     """
     from deal_hw.data.checks.blind import find_blind, seen
+    from deal_hw.data.checks.following import followed_part
     from deal_hw.data.checks.spikes import with_samples, without_spikes
     from deal_hw.data.checks.suite import check
     from deal_hw.data.table import table_of
     from deal_hw.findings import Severity
 
-    smooth = {index: without_spikes(trajectory, spikes) for index, trajectory in trajectories.items()}
+    smooth = {index: without_spikes(followed_part(one), spikes) for index, one in trajectories.items()}
     tables = {index: table_of(trajectory) for index, trajectory in smooth.items()}
     blind = find_blind(tables.values(), spikes)
     verdicts = {index: check(trajectory, spikes, blind) for index, trajectory in trajectories.items()}
     for index, found in verdicts.items():
-        failed = [v.message for v in found if v.severity is Severity.FAIL]
-        if failed:
-            raise InsufficientDataError(
-                f"episode {index} of {folder} cannot be used: {'; '.join(failed)}; "
-                "record again with `deal-hw collect`"
-            )
-        for jump in [v for v in found if v.code in ("spikes", "blind") and v.severity is Severity.WARN]:
-            say(f"episode {index}: {jump.message}")
+        for one in [v for v in found if v.code in _REPORTED and v.severity is Severity.WARN]:
+            say(f"episode {index}: {one.message}")
+        if failed := "; ".join(v.message for v in found if v.severity is Severity.FAIL):
+            del smooth[index]
+            if index in named:
+                raise InsufficientDataError(
+                    f"episode {index} of {folder} cannot be used: {failed}; name others (--episodes, "
+                    "--holdout), or record again with `deal-hw collect`"
+                )
+            say(f"episode {index} is left out: {failed}")
     lines = [f"episode {i}: {v.severity}: {v.message}" for i, found in verdicts.items() for v in found]
     return {i: with_samples(trajectory, seen(tables[i], blind)) for i, trajectory in smooth.items()}, lines
-
-
-def choose_episodes(
-    dataset: Dataset, episodes: Sequence[int], holdout: Sequence[int], say: Say = silent
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the fitted and the held-out episodes.
-
-    Raises:
-        ConfigurationError: No episode is left to fit, or one is in both lists.
-    """
-    every = range(len(dataset.episodes))
-    metadata = [read_metadata(dataset.path(i)) for i in every]
-    judges = (i for i in every if motion_of(metadata[i]) == HELDOUT_MOTION and i not in episodes)
-    # An episode that is named twice must not count twice.
-    episodes, holdout = tuple(dict.fromkeys(episodes)), tuple(dict.fromkeys(holdout))
-    held = holdout or tuple(judges)
-    repeated = [] if episodes else [i for i in every[:-1] if _repeats(metadata[i + 1], metadata[i])]
-    if repeated:
-        say(
-            f"episodes {repeated} hardly moved and were recorded again, so they are not fitted (--episodes "
-            "overrides this)"
-        )
-    fit = episodes or tuple(i for i in every if i not in held and i not in repeated)
-    both = sorted(set(fit) & set(held))
-    if both:
-        raise ConfigurationError(
-            f"episodes {both} are both fitted and held out; a held-out episode must not be fitted: remove "
-            "it from --episodes or --holdout"
-        )
-    if not fit:
-        raise ConfigurationError(
-            f"nothing to fit: the dataset has {len(every)} episodes, {len(held)} of them held out; record "
-            "one with `deal-hw collect --motion rich`"
-        )
-    return fit, held
-
-
-def _repeats(one: Mapping[str, Any], former: Mapping[str, Any]) -> bool:
-    """Return whether a recording repeats the one before with a stronger motion, by their metadata."""
-    same = all(one.get(key) == former.get(key) for key in ("seed", "seconds"))
-    same = same and motion_of(one) == motion_of(former)
-    return same and one.get("attempt", 0) == former.get("attempt", 0) + 1

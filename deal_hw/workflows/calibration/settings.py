@@ -254,12 +254,12 @@ class DatasetSettings(CalibrateSettings):
     """Dataset folder, such as runs/first/dataset."""
 
     episodes: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
-    """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out
-    ones."""
+    """Numbers of the episodes of the dataset to fit (the first is 0); by default all but the held-out ones,
+    and those whose run tripped or failed (`deal-hw data info` shows them, `deal-hw data keep` uses them)."""
 
     holdout: Annotated[tuple[int, ...], Range(0, 1_000_000)] = ()
     """Held-out episodes, which only test the result, by number (the first is 0). By default those collected
-    with --motion chirp."""
+    with --motion chirp whose run did not trip or fail."""
 
     sample_hz: Annotated[float | None, Range(1, 1e5, "Hz")] = None
     """Rate of the fitted and held-out states of a dataset, approximately [Hz]; by default four per control

@@ -23,6 +23,7 @@ from deal_hw.control.process.channel import (
 from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.supervisor import ChildEnd, Supervisor
 from deal_hw.control.safety.passive import PassiveConfig, make_passive
+from deal_hw.data.checks.following import followed_part
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
@@ -192,7 +193,8 @@ class EpisodeRun:
         from deal_hw.motions.scores.replay_error import replay_error
 
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
-        return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
+        recorded, replayed = read_trajectory(Path(self._plan.recording)), trajectory
+        return replay_error(followed_part(recorded), followed_part(replayed), before_s)
 
     def _make_passive(self, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""

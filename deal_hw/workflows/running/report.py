@@ -97,6 +97,8 @@ class EpisodeReport:
             lines.append(f"  clipped by the safety filter: {limit} in {cycles} cycles")
         if self.path is not None:
             lines.append(f"  recorded {self.states_recorded} states in {self.path}")
+            if self.outcome in (Outcome.TRIPPED, Outcome.FAILED):
+                lines.append("  calibrate leaves this episode out")
             if self.outcome is Outcome.TRIPPED:
                 lines.append(f"  to see why: deal-hw inspect {self.path} ({page('troubleshooting.md')})")
         if self.walk is not None and self.walk.seconds:

@@ -137,6 +137,7 @@ def _record(
         cycles_sent=end.cycles_sent,
         states_recorded=states,
         error=end.error,
+        flags=end.flags,
     )
     moved = store.note_episode(path, {**kept, **report.to_json()})[0].excitation
     return report if moved is None else dataclasses.replace(report, motion=Excitation(**moved))

@@ -18,6 +18,7 @@ from deal_hw.motions.excitation.level import ExcitationLevelSearch, shortfalls
 from deal_hw.ranges import option
 from deal_hw.robot import Robot
 from deal_hw.robots.connect import make_robot
+from deal_hw.workflows.causes import BY_MOTION
 from deal_hw.workflows.options import File
 from deal_hw.workflows.robot import is_user_robot, keep_robot
 from deal_hw.workflows.running.commander import HOLDS_LAST_COMMAND, claimed, connected, noted, suspend
@@ -263,8 +264,8 @@ def _to_repeat(
     if plan.motion != "rich" or not judged or plan.dry_run or description.floating_base is not None:
         return False
     tripped = report.reason if report.outcome is Outcome.TRIPPED else ""
-    if tripped and not report.passive_confirmed:
-        # The connection is lost or the robot hangs: a gentler motion would not help.
+    if tripped and not (report.passive_confirmed and BY_MOTION.intersection(report.flags)):
+        # Such as a busy computer, which the report's warnings name: a gentler motion would not help.
         return False
     return report.motion is not None and search.tell(shortfalls(report.motion, description), tripped)
 
