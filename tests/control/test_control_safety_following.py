@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from deal_hw.control.safety.following import LOAD_S, FollowingWatch, Unfollowed
@@ -271,7 +271,7 @@ def test_commands_of_effort_are_not_watched() -> None:
 
 
 def test_a_repeated_state_adds_nothing_and_a_pause_little() -> None:
-    """The same state again counts no time; of a pause of 10 s only 0.1 s count: twice, after the dead time."""
+    """The same state again counts no time; of a pause of 10 s only 0.1 s count, here twice."""
     watch, at, speed = FollowingWatch(robot()), np.zeros(2), np.zeros(2)
     watch.step(0, at, speed, command(0.0, 0.0))
     for _ in range(100):
@@ -310,7 +310,7 @@ def test_exchanged_readings_name_both_joints() -> None:
     found = play(FollowingWatch(robot(limit=100.0)), sines, lambda t: sines(t)[::-1], effort_limit=100.0)
     assert found is not None
     time_s, lost = found
-    assert time_s < 1.0 and lost.joints == ("a", "b")
+    assert time_s < 1.5 and lost.joints == ("a", "b")
     assert "'a' does not follow: its reading fits the set-point of 'b'" in lost.reason
 
 
@@ -329,7 +329,7 @@ def test_a_turned_reading_is_named() -> None:
         return a, -b
 
     found = play(FollowingWatch(robot(limit=100.0)), sines, turned, effort_limit=100.0)
-    assert found is not None and found[0] < 1.0
+    assert found is not None and found[0] < 1.5
     assert found[1].joints == ("b",) and "with the other sign" in found[1].reason
 
 
@@ -360,7 +360,7 @@ def test_since_when_a_misread_joint_did_not_follow() -> None:
 
 
 def test_one_odd_reading_is_forgiven_and_two_are_a_jump() -> None:
-    """0.3 rad in 20 ms are more than 0.05 rad and twice 5 rad/s; the second odd state trips."""
+    """0.3 rad in 20 ms are more than 0.04 rad and 1.25 times 5 rad/s; the second odd state trips."""
 
     def one(time_s: float) -> tuple[float, float]:
         return (0.3 if math.isclose(time_s, 0.5) else 0.0), 0.0
@@ -375,9 +375,9 @@ def test_one_odd_reading_is_forgiven_and_two_are_a_jump() -> None:
     assert found[1].since_ns == pytest.approx(480 * MS, abs=1)
 
 
-@pytest.mark.parametrize(("change", "finds"), [(0.249, False), (0.251, True)])
+@pytest.mark.parametrize(("change", "finds"), [(0.164, False), (0.166, True)])
 def test_the_size_of_a_jump(change: float, finds: bool) -> None:
-    """0.05 rad and 2 * 5 rad/s * 20 ms are 0.25 rad."""
+    """0.04 rad and 1.25 * 5 rad/s * 20 ms are 0.165 rad."""
     found = play(FollowingWatch(robot()), still(0.0, 0.0), lambda t: (change if t > 1.0 else 0.0, 0.0))
     assert (found is not None and "jumped" in found[1].reason) is finds
 
@@ -396,7 +396,7 @@ def test_without_a_trip_speed_nothing_jumps() -> None:
 
 @settings(max_examples=30)
 @given(
-    frequency=st.floats(4.0, 60.0),
+    frequency=st.floats(5.0, 60.0),
     damping=st.floats(0.2, 2.0),
     friction=st.floats(0.0, 0.1),
     load=st.floats(-0.5, 0.5),
@@ -413,7 +413,11 @@ def test_a_sound_joint_never_trips(
     size: float,
     weaker: float,
 ) -> None:
-    """A drive with another stiffness than its description's, friction, and a load that bends it."""
+    """A drive with another stiffness than its description's, friction, and a load that bends it.
+
+    The joint is at most 0.2 s behind its set-point.
+    """
+    assume(2 * damping / frequency <= 0.2)
     inertia = STIFFNESS / frequency**2
     step_s, q, v = 2e-3, load * LIMIT / STIFFNESS, 0.0
     watch = FollowingWatch(robot(units=("rad",)))

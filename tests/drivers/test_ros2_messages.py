@@ -22,9 +22,11 @@ from deal_hw.drivers.ros2.messages import (
     HASHES,
     JointStates,
     TrajectoryPoint,
+    decode_activity,
     decode_joint_states,
     decode_point,
     decode_positions,
+    encode_activity,
     encode_joint_states,
     encode_point,
     encode_positions,
@@ -177,3 +179,39 @@ def test_hashes_have_the_form_of_rep_2016() -> None:
     """One of each of the four types; 64 hexadecimal digits."""
     assert len(HASHES) == 4
     assert all(text.startswith("RIHS01_") and len(bytes.fromhex(text[7:])) == 32 for text in HASHES.values())
+
+
+@given(
+    st.dictionaries(
+        st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=12),
+        st.integers(0, 4),
+        max_size=5,
+    )
+)
+def test_an_activity_comes_back_as_it_was(controllers: dict[str, int]) -> None:
+    """Names of controllers and their states, whatever follows them."""
+    assert decode_activity(encode_activity(1_700_000_000_123_456_789, controllers)) == controllers
+
+
+def test_the_bytes_of_an_activity() -> None:
+    """Stamp 1.000000002 s, no frame, controller `a` active, no hardware component: counted by hand."""
+    payload = encode_activity(1_000_000_002, {"a": 3})
+    assert payload.hex(" ", 4) == (
+        "00010000 01000000 02000000 01000000 00000000 01000000 02000000 61000300 07000000 61637469 76650000 "
+        "00000000"
+    )
+
+
+@pytest.mark.parametrize("cut", range(4, 44, 3))
+def test_a_cut_activity_is_refused(cut: int) -> None:
+    """Whatever is missing of the controllers."""
+    with pytest.raises(FrameError):
+        decode_activity(encode_activity(0, {"arm": 3})[:cut])
+
+
+def test_a_count_of_controllers_beyond_all_sense_is_refused() -> None:
+    """Nothing is allocated for it."""
+    payload = bytearray(encode_activity(0, {}))
+    payload[20:24] = (2**32 - 1).to_bytes(4, "little")
+    with pytest.raises(FrameError, match="controllers"):
+        decode_activity(bytes(payload))

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from ros2_rig import COMMANDS, Ros2Rig, Topics, changed, with_
 
+from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
+from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import make_passive
+from deal_hw.control.safety.safety import Safety
+from deal_hw.data.recording.record import CycleRecord
 from deal_hw.drivers.ros2.connect import ros2_robot
 from deal_hw.drivers.ros2.device import EPOCH_NS
+from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.messages import (
     JointStates,
     TrajectoryPoint,
@@ -25,9 +30,11 @@ from deal_hw.errors import (
     SafetyError,
 )
 from deal_hw.testing.faults import OneBadFrame
+from deal_hw.testing.joint_faults import JointFaults
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, TopicEnd
-from deal_hw.types import Status
+from deal_hw.types import NOT_FOLLOWING, FloatArray, Status
+from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 
 CDR_KIND = 1
 """The byte of the CDR header that says how numbers are written."""
@@ -406,3 +413,125 @@ def test_a_cut_wire_passes_nothing(rig: Ros2Rig) -> None:
     rig.pass_time(0.5)
     rig.run(5)
     assert rig.device.accepted > accepted
+
+
+# A robot that does not follow, in the middle of a run.
+
+FAULT_S = 2.0
+"""When it begins, after the first command of the motion; it lasts 2 s."""
+
+
+class FaultyRun:
+    """A multisine of 6 s in which something fails; the clock goes on after its end.
+
+    Attributes:
+        report: How it ended.
+        passive_s: From the fault to the first cycle without a command [s].
+        kinds: Kinds of the events.
+    """
+
+    def __init__(self, rig: Ros2Rig, fault: str, *, silent: bool) -> None:
+        self._rig = rig
+        self.kinds: set[str] = set()
+        self._first_ns = self._begun_ns = self._sent_ns = -1
+        self._fault, self._silent = fault, silent
+        d = rig.description
+        plan = RunPlan(robot="arm", motion="excite", excite="multisine", seconds=6.0, seed=1)
+        self.report: LoopReport = ControlLoop(
+            rig.robot,
+            make_behaviour(plan, d),
+            Safety(d),
+            rig.clock,
+            self._sink,
+            LoopConfig(duration_s=6.0),
+        ).run()
+        self.passive_s = (self._sent_ns - self._begun_ns) * 1e-9
+
+    def _sink(self, record: CycleRecord) -> bool:
+        self.kinds |= {event.kind for event in record.events}
+        if record.sent is None:
+            return True
+        self._first_ns = record.start_ns if self._first_ns < 0 else self._first_ns
+        self._sent_ns = record.start_ns
+        if self._begun_ns < 0 and record.start_ns - self._first_ns >= FAULT_S * 1e9:
+            self._begun_ns = record.start_ns
+            device = self._rig.device
+            device._controller_faults = ControllerFaults(silent_manager=self._silent)
+            if self._fault == "controller":
+                device.active = False
+            else:
+                names = {"limp": "limp_after_s", "held": "held_after_s"}
+                device._joint_faults.give(JointFaults(**{names[self._fault]: 0.0}), device.device_ns)
+        return True
+
+    def speeds(self, seconds: float) -> FloatArray:
+        """Let time pass, and return the joints' largest true speeds in it [rad/s]."""
+        device, before, fastest = self._rig.device, self._rig.true_position(), 0.0
+        for _ in range(round(seconds / 0.01)):
+            device.advance_to(device.device_ns + 10_000_000)
+            now = self._rig.true_position()
+            fastest = max(fastest, float(np.abs(now - before).max()) / 0.01)
+            before = now
+        return np.array(fastest)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("fault", ["controller", "limp", "held"])
+def test_a_robot_that_does_not_follow_is_passive_and_does_not_jump_when_it_does_again(
+    tmp_path: Path, fault: str, command: str
+) -> None:
+    """Nothing on the wire says so: it is seen in the motion, in less than the 2 s that the fault lasts."""
+    rig = Ros2Rig(tmp_path, command)
+    run = FaultyRun(rig, fault, silent=True)
+    assert run.report.outcome is Outcome.TRIPPED and run.report.flags == ("not_following",)
+    assert run.passive_s < 2.0 and NOT_FOLLOWING in run.kinds
+    assert run.report.passive_confirmed
+    run.speeds(2.0 - run.passive_s)
+    rig.device.active = True
+    assert run.speeds(1.0) < 0.5
+    # The next run begins where the robot is, at the speed of homing.
+    rig.robot.connect()
+    begun_ns, at = rig.clock.now_ns(), rig.true_position()
+    rig.robot.home(20.0)
+    passed_s = (rig.clock.now_ns() - begun_ns) * 1e-9
+    assert np.abs(rig.true_position() - at).max() <= 0.5 * passed_s
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_controller_managers_word_ends_a_run_at_once(tmp_path: Path, command: str) -> None:
+    """Since ROS 2 Jazzy it says which controllers are active: the next cycle is passive."""
+    run = FaultyRun(Ros2Rig(tmp_path, command), "controller", silent=False)
+    assert run.report.flags == ("device_fault",)
+    assert "says that forward_position_controller is inactive: it takes no commands" in run.report.reason
+    assert run.passive_s <= 0.04
+
+
+def test_an_inactive_controller_is_refused_before_any_command(rig: Ros2Rig) -> None:
+    """And named with the command that activates it."""
+    rig.robot.connect()
+    rig.device.active = False
+    with pytest.raises(SafetyError, match=r"is inactive.*switch_controllers --activate forward_position"):
+        rig.robot.home(20.0)
+    assert rig.device.accepted == 0
+
+
+def test_a_passive_robot_that_was_moved_is_held_where_it_is(rig: Ros2Rig) -> None:
+    """Its drives were off, and somebody moved it by 1 rad: it is not brought back."""
+    rig.armed()
+    rig.run(20)
+    rig.robot.passive()
+    rig.pass_time(0.1)
+    rig.device.place(np.array([1.0, -0.8]))
+    rig.pass_time(0.05)
+    rig.robot.passive()
+    rig.pass_time(1.0)
+    np.testing.assert_allclose(rig.true_position(), (1.0, -0.8), atol=0.1)
+
+
+def test_an_activity_message_that_is_none_counts_as_an_error(rig: Ros2Rig) -> None:
+    """A run goes on: nothing is known of the controller."""
+    robot = rig.armed()
+    before = robot.transport_errors
+    rig.virtual.publish(rig.topics.activity, b"\x00\x01\x00\x00" + bytes(7))
+    rig.run(5)
+    assert robot.transport_errors > before and robot.fault == ""

@@ -32,8 +32,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 PUSH_S: Final = 0.3
 """A push at the drive's limit without motion for this long, or a smaller one for longer, is no following [s].
-tools/measure_following.py has what shipped motions reach. On eight recordings of a real SO-101 (isaac-sim2real/
-sage) it is at most 0.12; where its fingertip presses on a table 0.29, and with 1.6 times the stiffness more."""
+tools/measure_following.py has what shipped motions reach. On eight recordings of a real SO-101 (from
+isaac-sim2real/sage) it is at most 0.12, and 0.29 where its fingertip presses on a table. With a stiffness
+that is 1.6 times too high it is above 0.3 there, and at most 0.22 elsewhere."""
 LEAST_PUSH: Final = 0.15
 """A smaller share of the drive's limit beyond the usual load does not count: friction, or a new load."""
 LOAD_S: Final = 1.0
@@ -53,15 +54,22 @@ UNKNOWN_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.5, "m": 0
 MOVED: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.02, "m": 0.004})
 FASTER: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.2, "m": 0.04})
 """Motion, or gain of speed, in the direction of the push by which a joint follows [rad, m; rad/s, m/s]."""
-JUMP: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.05, "m": 0.01})
-JUMP_SPEEDS: Final = 2.0
+JUMP: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.04, "m": 0.008})
+JUMP_SPEEDS: Final = 1.25
 """A reading that changes by more than this, plus this many times the trip speed, has jumped [rad or m]."""
-ELSEWHERE: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.12, "m": 0.024})
-FITS: Final = 0.2
+ELSEWHERE: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.08, "m": 0.016})
+FITS: Final = 0.45
 """A reading that is so far from its own set-point, and at most this share of it from another one, is not the
-joint's own; both are means over some tenths of a second, of slow motion [rad or m]."""
-SLOW_S: Final = 0.1
-MEAN_S: Final = 0.5
+joint's own [rad or m]. Both are means over ``MEAN_S`` of the motion around a mean over ``CENTRE_S``: joints
+that are bent by loads must not look so. With shipped motions the share is at least 0.6, with exchanged readings 0.21
+to 0.44 (tools/measure_following.py)."""
+BEHIND_S: Final = tuple(0.02 * k for k in range(16))
+"""How far a joint may be behind its set-point [s]; the nearest of these counts."""
+TURNED_FITS: Final = 0.35
+"""The same share for a reading of the other sign: with shipped motions at least 0.78, else 0.13 to 0.31."""
+MEAN_S: Final = 0.7
+CENTRE_S: Final = 1.5
+_SMOOTH_S: Final = 0.1
 _LONGEST_STEP_S: Final = 0.1
 """Time that a step counts at most [s]: after a pause of this computer nobody knows what was in force."""
 
@@ -113,6 +121,8 @@ class FollowingWatch:
         self._jump, self._elsewhere = by_unit(JUMP), by_unit(ELSEWHERE)
         self._speed = np.array(d.limits.trip_velocity, dtype=float)[index]
         self._may_be_blocked = np.isin(d.actuated, d.limits.may_be_blocked)
+        steps = [round(behind_s * d.control_rate_hz) for behind_s in BEHIND_S]
+        self._behind = -1 - np.array(steps)
         self._like = np.equal.outer(units, units) & ~np.eye(len(units), dtype=bool)
         self.reset()
 
@@ -166,9 +176,11 @@ class FollowingWatch:
         self._from, self._from_velocity = position.copy(), velocity.copy()
         self._followed_ns, self._near_ns = np.full(count, now_ns), np.full(count, now_ns)
         self._before, self._odd = position.copy(), np.zeros(count, dtype=bool)
-        self._slow = [position.copy() for _ in range(2)] + [self._setpoint.copy() for _ in range(3)]
-        self._off = np.zeros((count, count))
-        self._off_turned = np.zeros(count)
+        self._judged_s = 0.0
+        self._centre, self._target_centre = position.copy(), self._setpoint.copy()
+        self._setpoints = np.zeros((-int(self._behind.min()), count))
+        self._off = np.zeros((len(BEHIND_S), count, count))
+        self._off_turned = np.zeros((len(BEHIND_S), count))
 
     def _share(self, position: FloatArray, command: JointCommand) -> FloatArray:
         """Return the drives' pushes as shares of their limits, with sign, (A,)."""
@@ -223,7 +235,7 @@ class FollowingWatch:
 
     def _swung(self, position: FloatArray, share: FloatArray, passed_s: float) -> BoolArray:
         """Return which joints stand although they were pushed to both sides, (A,)."""
-        self._smooth = self._smooth + (share - self._smooth) * (1.0 - np.exp(-passed_s / SLOW_S))
+        self._smooth = self._smooth + (share - self._smooth) * (1.0 - np.exp(-passed_s / _SMOOTH_S))
         moved = np.abs(position - self._at) >= self._stands
         self._at = np.where(moved, position, self._at)
         self._rest = np.where(moved, self._smooth, self._rest)
@@ -254,47 +266,48 @@ class FollowingWatch:
         self, now_ns: int, position: FloatArray, command: JointCommand, passed_s: float
     ) -> Unfollowed | None:
         """Find readings that fit another joint's set-point, or the own one with the other sign."""
-        slow = 1.0 - np.exp(-passed_s / SLOW_S)
-        reading, target = position, self._setpoint
-        for k in range(2):
-            reading = self._slow[k] = self._slow[k] + slow * (reading - self._slow[k])
-        # Once more than the reading, since a joint is some tenths of a second behind its set-point.
-        for k in range(2, 5):
-            target = self._slow[k] = self._slow[k] + slow * (target - self._slow[k])
-        mean = 1.0 - np.exp(-passed_s / MEAN_S)
-        self._off += mean * (np.subtract.outer(reading, target) ** 2 - self._off)
-        self._off_turned += mean * ((reading + target) ** 2 - self._off_turned)
+        centre, mean = 1.0 - np.exp(-passed_s / CENTRE_S), 1.0 - np.exp(-passed_s / MEAN_S)
+        self._centre = self._centre + centre * (position - self._centre)
+        self._target_centre = self._target_centre + centre * (self._setpoint - self._target_centre)
+        moved = position - self._centre
+        self._setpoints = np.concatenate((self._setpoints[1:], self._setpoint[None] - self._target_centre))
+        before = self._setpoints[self._behind]
+        self._off += mean * ((moved[None, :, None] - before[:, None, :]) ** 2 - self._off)
+        self._off_turned += mean * ((moved + before) ** 2 - self._off_turned)
         near = np.abs(position - self._setpoint) < self._elsewhere
         self._near_ns = np.where(near, now_ns, self._near_ns)
         # A drive that is set to be weak may stay behind.
         weak = self._limited & (command.effort_limit < 0.5 * self._limit)
-        self._off[weak] = 0.0
-        self._off_turned[weak] = 0.0
-        own = np.sqrt(np.diag(self._off))
-        far = own >= self._elsewhere
+        self._off[:, weak] = 0.0
+        self._off_turned[:, weak] = 0.0
+        off = np.sqrt(self._off.min(axis=0))
+        own = np.diag(off)
+        self._judged_s += passed_s
+        far = (own >= self._elsewhere) & (self._judged_s >= MEAN_S)
         if not far.any():
             return None
-        turned = far & (np.sqrt(self._off_turned) <= FITS * own)
-        if turned.any():
-            name = self._names[int(np.argmax(turned))]
+        # As shares of the distance from the own set-point; the better explanation is named.
+        scale = np.where(far, own, np.nan)
+        turned = np.nan_to_num(np.sqrt(self._off_turned.min(axis=0)) / scale, nan=np.inf)
+        fits = np.where(self._like, np.nan_to_num(off / scale[:, None], nan=np.inf), np.inf)
+        exchanged = np.maximum(fits, fits.T)
+        if exchanged.min() <= FITS and exchanged.min() <= turned.min():
+            first, second = (int(k) for k in np.unravel_index(exchanged.argmin(), exchanged.shape))
             return self._unfollowed(
-                turned,
+                np.isin(np.arange(len(own)), (first, second)),
                 self._near_ns,
-                f"joint {name!r} does not follow: its reading is its set-point with the other sign. Its "
-                "encoder or its direction is turned; correct it before the next run",
+                f"joint {self._names[first]!r} does not follow: its reading fits the set-point of "
+                f"{self._names[second]!r}, and that one's fits its own. The two are exchanged: in the order "
+                "of joints, in cables or in ids",
             )
-        fits = self._like & far[:, None] & (np.sqrt(self._off) <= FITS * own[:, None])
-        exchanged = fits & fits.T
-        if not exchanged.any():
-            return None
-        first, second = (int(k) for k in np.argwhere(exchanged)[0])
-        return self._unfollowed(
-            exchanged.any(axis=1),
-            self._near_ns,
-            f"joint {self._names[first]!r} does not follow: its reading fits the set-point of "
-            f"{self._names[second]!r}, and that one's fits its own. The two are exchanged: in the order of "
-            "joints, in cables or in ids",
-        )
+        if turned.min() <= TURNED_FITS:
+            return self._unfollowed(
+                turned <= TURNED_FITS,
+                self._near_ns,
+                f"joint {self._names[int(turned.argmin())]!r} does not follow: its reading is its set-point "
+                "with the other sign. Its encoder or its direction is turned; correct it before the next run",
+            )
+        return None
 
     def _unfollowed(self, which: BoolArray, last_ns: IntArray, reason: str) -> Unfollowed:
         """Return what was found about some joints.
