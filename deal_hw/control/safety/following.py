@@ -61,8 +61,8 @@ ELSEWHERE: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.08, "m": 0.01
 FITS: Final = 0.45
 """A reading that is so far from its own set-point, and at most this share of it from another one, is not the
 joint's own [rad or m]. Both are means over ``MEAN_S`` of the motion around a mean over ``CENTRE_S``: joints
-that are bent by loads must not look so. With shipped motions the share is at least 0.6, with exchanged readings 0.21
-to 0.44 (tools/measure_following.py)."""
+that are bent by loads must not look so. The share is at least 0.6 with shipped motions, and 0.21 to 0.44 with
+exchanged readings (tools/measure_following.py)."""
 BEHIND_S: Final = tuple(0.02 * k for k in range(16))
 """How far a joint may be behind its set-point [s]; the nearest of these counts."""
 TURNED_FITS: Final = 0.35
