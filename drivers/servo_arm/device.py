@@ -9,9 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
+from deal_hw.drivers.servo_arm.emulated_families import DOUBLED, FOREIGN, EmulatedJoint
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
 from deal_hw.drivers.servo_arm.faults import ArmFaults
+from deal_hw.drivers.servo_arm.other_master import OtherMaster
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
@@ -79,6 +80,8 @@ class ArmDevice:
         self._of_id = {servo.id: j for j, servo in enumerate(self._servos)}
         self._due = self._schedule(faults or ArmFaults())
         self._first_ns: int | None = None
+        self._other: OtherMaster | None = None
+        self._bus_trouble = ""
         limits = dict(zip(d.actuated, d.effort_limit, strict=True))
         # Without a limit nothing says what share of the voltage an effort takes.
         self._most = [
@@ -151,7 +154,7 @@ class ArmDevice:
     def trouble(self) -> str:
         """Current fault of a servo; "" for none."""
         found = (joint.trouble(self._now_ns) for joint in self.joints)
-        return next((trouble for trouble in found if trouble), "")
+        return next((trouble for trouble in found if trouble), self._bus_trouble)
 
     @property
     def frame_errors(self) -> int:
@@ -200,6 +203,8 @@ class ArmDevice:
             (faults.servo_absent_after_s, lambda: joint.unplug(self._now_ns)),
             (faults.servo_reboot_after_s, lambda: joint.restart(self._now_ns)),
             (faults.servo_overload_after_s, joint.overload),
+            (faults.duplicate_id_after_s, lambda: self._double(joint)),
+            (faults.foreign_writer_after_s, lambda: self._let_write(joint, faults)),
         ]
         return sorted(((at_s, act) for at_s, act in acts if at_s is not None), key=lambda due: due[0])
 
@@ -212,10 +217,23 @@ class ArmDevice:
                 return
             self._due.pop(0)[1]()
 
+    def _double(self, joint: EmulatedJoint) -> None:
+        """Plug in a second servo with a servo's id."""
+        self.bus.servos.append(joint.twin())
+        self._bus_trouble = DOUBLED
+
+    def _let_write(self, joint: EmulatedJoint, faults: ArmFaults) -> None:
+        """Let another program write a servo's goals."""
+        rate_hz, shown = faults.foreign_rate_hz, faults.foreign_on_line
+        self._other = OtherMaster(joint, self.bus, rate_hz, shown=shown, begin_ns=self._now_ns)
+        self._bus_trouble = FOREIGN
+
     def _step(self) -> None:
         now_ns = self._tick * self._tick_ns
         if self._due:
             self._fail()
+        if self._other is not None and self._other.advance(now_ns):
+            self._take_goals(now_ns)
         for joint in self.joints:
             joint.tick(now_ns, now_ns - self.bus.alive_ns)
         while self._coming and self._coming[0][0] <= self._tick:

@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 from deal_hw.drivers.servo_arm.families import OFF, ON, Dynamixel, Feetech, LoopGains
+from deal_hw.drivers.servo_bus import packets, xl330
 from deal_hw.drivers.servo_bus import registers as r
-from deal_hw.drivers.servo_bus import xl330
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
 from deal_hw.drivers.servo_bus.emulated_servo import OVERLOAD_ERROR, EmulatedServo
 from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
 from deal_hw.drivers.servo_bus.feetech.emulated_servo import StsServo
-from deal_hw.drivers.servo_bus.feetech.packets import Fault
+from deal_hw.drivers.servo_bus.feetech.packets import BROADCAST, Fault, StsInstruction, encode
 from deal_hw.drivers.servo_bus.registers import OperatingMode
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.sim.robots.hardware_section import ServoEntry
@@ -23,8 +23,16 @@ _COUNTS_S: Final = 60 / (0.229 * r.PULSES)
 """Units of a velocity register in a tick a second."""
 
 
-ABSENT, RESTARTS, OVERLOAD = TROUBLES = ("servo absent", "servo restarts", "overload")
-"""Faults of a servo, in words."""
+ABSENT, RESTARTS, OVERLOAD, DOUBLED, FOREIGN = TROUBLES = (
+    "servo absent",
+    "servo restarts",
+    "overload",
+    "two servos of one id",
+    "another program writes goals",
+)
+"""Faults of a servo or its bus, in words."""
+TWIN_TICKS: Final = 700
+"""How far a second servo with one's id stands from it."""
 
 
 class EmulatedJoint(abc.ABC):
@@ -105,6 +113,14 @@ class EmulatedJoint(abc.ABC):
     def overload(self) -> None:
         """Report an overload whose cause stays."""
 
+    @abc.abstractmethod
+    def twin(self) -> EmulatedServo | StsServo:
+        """Return another servo with the same id, without torque, which stands elsewhere."""
+
+    @abc.abstractmethod
+    def goal_packet(self, ticks: int) -> bytes:
+        """Return the packet by which another master writes its goal."""
+
 
 class DynamixelJoint(EmulatedJoint):
     """An emulated X-series servo.
@@ -168,6 +184,21 @@ class DynamixelJoint(EmulatedJoint):
         """Report an overload; it gives no torque until it restarts."""
         self.servo.fail(OVERLOAD_ERROR)
 
+    def twin(self) -> EmulatedServo:
+        """Return another servo with the same id."""
+        model = self.servo.get(r.MODEL_NUMBER)
+        twin = EmulatedServo(self.servo.id, self.servo.baud_rate, mode=OperatingMode.POSITION, model=model)
+        twin.sense(self.servo.block.present_position + TWIN_TICKS)
+        twin.forget_turns()
+        return twin
+
+    def goal_packet(self, ticks: int) -> bytes:
+        """Return a sync write of Goal Position."""
+        goal = r.GOAL_POSITION
+        head = goal.address.to_bytes(2, "little") + goal.size.to_bytes(2, "little")
+        data = bytes([self.servo.id]) + ticks.to_bytes(goal.size, "little")
+        return packets.instruction(packets.BROADCAST, packets.Instruction.SYNC_WRITE, head + data)
+
 
 class StsJoint(EmulatedJoint):
     """An emulated STS servo, with the homing offset 0.
@@ -223,6 +254,19 @@ class StsJoint(EmulatedJoint):
     def overload(self) -> None:
         """Report an overload; it holds with Protective Torque until it restarts."""
         self.servo.fail(Fault.OVERLOAD, lasting=True)
+
+    def twin(self) -> StsServo:
+        """Return another servo with the same id."""
+        twin = StsServo(self.servo.id, self.servo.baud_rate, model=self.servo.get(f.MODEL_NUMBER))
+        twin.sense(self.servo.get(f.PRESENT_POSITION) + TWIN_TICKS)
+        twin.forget_turns()
+        return twin
+
+    def goal_packet(self, ticks: int) -> bytes:
+        """Return a sync write of Goal Position."""
+        goal = f.GOAL_POSITION
+        data = bytes([goal.address, goal.size, self.servo.id]) + f.encode(goal, ticks)
+        return encode(BROADCAST, StsInstruction.SYNC_WRITE, data)
 
 
 EmulatedArm: TypeAlias = tuple[Sequence[EmulatedJoint], ServosSide[Any]]

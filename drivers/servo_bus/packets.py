@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from fastcrc import crc16
+
+from deal_hw.drivers.servo_bus.servos_side import at_once
 
 HEADER: Final = b"\xff\xff\xfd\x00"
 BROADCAST: Final = 0xFE
@@ -94,13 +98,13 @@ def fast_status(parts: Sequence[tuple[int, int, bytes]], expected: int) -> bytes
     If a requested servo is absent, the packet ends before its part and is shorter than its length field says.
 
     Args:
-        parts: Id, error and data of each servo that answers, in order.
+        parts: Id, error and data of each servo that answers, in order. Those with one id answer at once.
         expected: Bytes of all requested parts: data, and four more bytes for each servo.
     """
     out = HEADER + bytes([BROADCAST]) + (1 + expected).to_bytes(2, "little") + bytes([_STATUS])
-    for servo, error, data in parts:
-        out += bytes([error, servo]) + data
-        out += crc(out).to_bytes(2, "little")
+    for servo, answers in groupby(parts, key=itemgetter(0)):
+        bodies = [bytes([error, servo]) + data for _, error, data in answers]
+        out += at_once(body + crc(out + body).to_bytes(2, "little") for body in bodies)
     return out
 
 

@@ -84,6 +84,15 @@ class ServosSide(abc.ABC, Generic[ServoT]):
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the requests that they complete."""
 
+    @abc.abstractmethod
+    def receive_foreign(self, packet: bytes, shown: bool) -> None:
+        """Take a whole packet of another master.
+
+        Args:
+            packet: Its bytes.
+            shown: Whether the host receives it, too.
+        """
+
     def _advance(self) -> None:
         """Let what the servos do by themselves follow the time, where the owner does not."""
 
