@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
+from dynamixel_rig import Wire, middle
 
-from deal_hw.clock import VirtualClock
 from deal_hw.control.safety.passive import make_passive
-from deal_hw.drivers.cartpole.dynamixel.device import OVERLOAD, DynamixelDevice
-from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
+from deal_hw.drivers.cartpole.dynamixel.device import OVERLOAD
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.cartpole.wire.protocol import Target
 from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
-from deal_hw.drivers.servo_bus.packets import BROADCAST, Instruction, instruction
 from deal_hw.drivers.servo_bus.registers import (
     DRIVE_MODE,
-    GOAL_POSITION,
     ID,
     MODEL_NUMBER,
     OPERATING_MODE,
@@ -32,7 +26,6 @@ from deal_hw.drivers.servo_bus.registers import (
     Register,
 )
 from deal_hw.drivers.transports.listen_only import listen_only
-from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import (
     ConfigurationError,
     SafetyError,
@@ -40,56 +33,9 @@ from deal_hw.errors import (
     WrongDeviceError,
 )
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
-from deal_hw.testing.robot_suite import RobotBench, RobotSuite, arm, default_command, run_cycles
+from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, Transport
-from deal_hw.types import RobotState, Status
-
-
-class Wire:
-    """An emulated cart-pole on two servos, its driver, and everything between them."""
-
-    def __init__(
-        self,
-        wrap: Callable[[Transport], Transport] = lambda transport: transport,
-        profile: str = "ideal",
-        device: DynamixelSettings | None = None,
-        **settings: Any,
-    ) -> None:
-        self.clock = VirtualClock()
-        if "cart_zero" not in settings:
-            settings["cart_zero"] = middle()
-        made = DynamixelSettings(**settings)
-        self.device = DynamixelDevice(nominal_truth(profile), device or made)
-        self.virtual = VirtualTransport(self.device, self.clock)
-        self.robot = DynamixelCartpole(wrap(self.virtual), self.clock, made)
-
-    @property
-    def cart(self) -> EmulatedServo:
-        """The belt servo."""
-        return self.device.servos[0]
-
-    @property
-    def pole(self) -> EmulatedServo:
-        """The pole servo."""
-        return self.device.servos[1]
-
-    def armed(self) -> DynamixelCartpole:
-        """Return the driver, connected, homed and armed, after its first command."""
-        arm(self.robot)
-        return self.robot
-
-    def run(self, cycles: int, target: float = 0.0) -> list[RobotState]:
-        """Command and read as the control loop does; return the states."""
-        return run_cycles(self.robot, self.clock, cycles, default_command(self.robot, target))
-
-
-@functools.cache
-def middle() -> int:
-    """Return where the emulated belt servo reads the middle, as a user would write it down."""
-    wire = Wire(cart_zero=None)
-    wire.robot.connect()
-    wire.robot.home(20.0)
-    return wire.robot._zero % 4096
+from deal_hw.types import Status
 
 
 class TestDynamixelCartpole(RobotSuite):
@@ -364,69 +310,6 @@ def test_an_absent_servo_costs_less_than_a_cycle() -> None:
     assert make_passive(robot, wire.clock)
     assert not wire.cart.get(TORQUE_ENABLE)
     assert np.isnan(robot.read_state(0.1).position[1])
-
-
-def write_beside(wire: Wire, rate_hz: float) -> None:
-    """Let another program send the belt servo to one place, again and again."""
-    goal = (wire.cart.block.goal_position + 200).to_bytes(GOAL_POSITION.size, "little", signed=True)
-    head = bytes([GOAL_POSITION.address, 0, GOAL_POSITION.size, 0, wire.cart.id])
-    packet = instruction(BROADCAST, Instruction.SYNC_WRITE, head + goal)
-    tick, due_ns = wire.device._run_tick, wire.clock.now_ns()
-
-    def tick_and_write() -> None:
-        nonlocal due_ns
-        tick()
-        if wire.clock.now_ns() >= due_ns:
-            due_ns += round(1e9 / rate_hz)
-            wire.device.bus.receive_foreign(packet, False)
-
-    wire.device._run_tick = tick_and_write  # type: ignore[method-assign]
-
-
-@pytest.mark.parametrize(("rate_hz", "most_ms"), [(200.0, 40), (60.0, 60)])
-def test_another_programs_goals_are_named(rate_hz: float, most_ms: int) -> None:
-    """By the second one that shows; then the motor is made passive, and stays so."""
-    wire = Wire()
-    robot = wire.armed()
-    wire.run(5)
-    write_beside(wire, rate_hz)
-    start_ns = wire.clock.now_ns()
-    while not robot.fault:
-        wire.run(1)
-        assert wire.clock.now_ns() - start_ns <= most_ms * 1_000_000
-    assert robot.fault.startswith("another program commands this bus: servo 1 (belt) has the goal ")
-    assert make_passive(robot, wire.clock)
-    assert not wire.cart.get(TORQUE_ENABLE)
-
-
-def test_another_program_is_named_while_homing() -> None:
-    """And not as a rail of another length."""
-    wire = Wire(cart_zero=None)
-    wire.robot.connect()
-    write_beside(wire, 60.0)
-    with pytest.raises(SafetyError, match=r"another program commands this bus: servo 1 \(belt\)"):
-        wire.robot.home(20.0)
-
-
-@pytest.mark.parametrize("servo", [1, 2])
-@pytest.mark.parametrize("fast", [True, False])
-def test_a_second_servo_of_one_id_is_named_in_a_run(servo: int, fast: bool) -> None:
-    """In 80 ms, as an absent one; no state has what the two answer together."""
-    wire = Wire()
-    wire.device.bus.fast_read = fast
-    robot = wire.armed()
-    wire.run(5)
-    twin = EmulatedServo(servo, wire.robot.settings.baud_rate)
-    twin.sense(300)
-    wire.device.servos.append(twin)
-    start_ns = wire.clock.now_ns()
-    states = []
-    while not robot.fault:
-        states += wire.run(1)
-        assert wire.clock.now_ns() - start_ns <= 80_000_000
-    part = "belt" if servo == 1 else "pole"
-    assert robot.fault.startswith(f"two servos answer as id {servo} ({part}), or its plug is loose")
-    assert not states
 
 
 def test_five_percent_of_corrupt_packets_in_both_directions_are_survived() -> None:
