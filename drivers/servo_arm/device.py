@@ -9,16 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from deal_hw.drivers.servo_arm.emulated_families import DOUBLED, FOREIGN, EmulatedJoint
+from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
 from deal_hw.drivers.servo_arm.faults import ArmFaults
-from deal_hw.drivers.servo_arm.other_master import OtherMaster
+from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN, WAY_TICKS, OtherMaster
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
+from deal_hw.sim.robots.hardware_section import RAD, TICKS, HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
 from deal_hw.types import FloatArray
 
@@ -219,13 +219,14 @@ class ArmDevice:
 
     def _double(self, joint: EmulatedJoint) -> None:
         """Plug in a second servo with a servo's id."""
-        self.bus.servos.append(joint.twin())
+        self.bus.servos.append(joint.servo.twin())
         self._bus_trouble = DOUBLED
 
     def _let_write(self, joint: EmulatedJoint, faults: ArmFaults) -> None:
         """Let another program write a servo's goals."""
-        rate_hz, shown = faults.foreign_rate_hz, faults.foreign_on_line
-        self._other = OtherMaster(joint, self.bus, rate_hz, shown=shown, begin_ns=self._now_ns)
+        # Towards the middle of its ticks.
+        goal = joint.goal + (WAY_TICKS if joint.goal < TICKS // 2 else -WAY_TICKS)
+        self._other = OtherMaster(joint.goal_packet(goal), self.bus, faults, self._now_ns)
         self._bus_trouble = FOREIGN
 
     def _step(self) -> None:

@@ -23,16 +23,8 @@ _COUNTS_S: Final = 60 / (0.229 * r.PULSES)
 """Units of a velocity register in a tick a second."""
 
 
-ABSENT, RESTARTS, OVERLOAD, DOUBLED, FOREIGN = TROUBLES = (
-    "servo absent",
-    "servo restarts",
-    "overload",
-    "two servos of one id",
-    "another program writes goals",
-)
-"""Faults of a servo or its bus, in words."""
-TWIN_TICKS: Final = 700
-"""How far a second servo with one's id stands from it."""
+ABSENT, RESTARTS, OVERLOAD = TROUBLES = ("servo absent", "servo restarts", "overload")
+"""Faults of a servo, in words."""
 
 
 class EmulatedJoint(abc.ABC):
@@ -114,10 +106,6 @@ class EmulatedJoint(abc.ABC):
         """Report an overload whose cause stays."""
 
     @abc.abstractmethod
-    def twin(self) -> EmulatedServo | StsServo:
-        """Return another servo with the same id, without torque, which stands elsewhere."""
-
-    @abc.abstractmethod
     def goal_packet(self, ticks: int) -> bytes:
         """Return the packet by which another master writes its goal."""
 
@@ -184,20 +172,9 @@ class DynamixelJoint(EmulatedJoint):
         """Report an overload; it gives no torque until it restarts."""
         self.servo.fail(OVERLOAD_ERROR)
 
-    def twin(self) -> EmulatedServo:
-        """Return another servo with the same id."""
-        model = self.servo.get(r.MODEL_NUMBER)
-        twin = EmulatedServo(self.servo.id, self.servo.baud_rate, mode=OperatingMode.POSITION, model=model)
-        twin.sense(self.servo.block.present_position + TWIN_TICKS)
-        twin.forget_turns()
-        return twin
-
     def goal_packet(self, ticks: int) -> bytes:
         """Return a sync write of Goal Position."""
-        goal = r.GOAL_POSITION
-        head = goal.address.to_bytes(2, "little") + goal.size.to_bytes(2, "little")
-        data = bytes([self.servo.id]) + ticks.to_bytes(goal.size, "little")
-        return packets.instruction(packets.BROADCAST, packets.Instruction.SYNC_WRITE, head + data)
+        return packets.sync_write(r.GOAL_POSITION, {self.servo.id: ticks})
 
 
 class StsJoint(EmulatedJoint):
@@ -254,13 +231,6 @@ class StsJoint(EmulatedJoint):
     def overload(self) -> None:
         """Report an overload; it holds with Protective Torque until it restarts."""
         self.servo.fail(Fault.OVERLOAD, lasting=True)
-
-    def twin(self) -> StsServo:
-        """Return another servo with the same id."""
-        twin = StsServo(self.servo.id, self.servo.baud_rate, model=self.servo.get(f.MODEL_NUMBER))
-        twin.sense(self.servo.get(f.PRESENT_POSITION) + TWIN_TICKS)
-        twin.forget_turns()
-        return twin
 
     def goal_packet(self, ticks: int) -> bytes:
         """Return a sync write of Goal Position."""

@@ -7,13 +7,14 @@ sides check each other.
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import Final, NamedTuple
 
 from fastcrc import crc16
 
+from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.drivers.servo_bus.servos_side import at_once
 
 HEADER: Final = b"\xff\xff\xfd\x00"
@@ -84,6 +85,14 @@ def packet(servo: int, body: bytes) -> bytes:
 def instruction(servo: int, code: int, params: bytes = b"") -> bytes:
     """Return an instruction packet."""
     return packet(servo, bytes([code]) + params)
+
+
+def sync_write(register: Register, values: Mapping[int, int]) -> bytes:
+    """Return the instruction packet that writes a register of several servos, by their ids."""
+    params = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
+    for servo, value in values.items():
+        params += bytes([servo]) + value.to_bytes(register.size, "little", signed=value < 0)
+    return instruction(BROADCAST, Instruction.SYNC_WRITE, params)
 
 
 def status(servo: int, error: int, data: bytes = b"") -> bytes:

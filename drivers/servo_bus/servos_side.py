@@ -7,9 +7,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from functools import reduce
 from operator import and_
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from deal_hw.drivers.servo_bus.registers import Register
+
+TWIN_TICKS: Final = 700
+"""How far a second servo with one's id stands from it."""
 
 
 class ListeningServo(Protocol):

@@ -6,27 +6,18 @@ import pytest
 from dynamixel_rig import Wire
 
 from deal_hw.control.safety.passive import make_passive
-from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
-from deal_hw.drivers.servo_bus.packets import BROADCAST, Instruction, instruction
+from deal_hw.drivers.servo_bus.faults import BusFaults
+from deal_hw.drivers.servo_bus.other_master import OtherMaster
+from deal_hw.drivers.servo_bus.packets import sync_write
 from deal_hw.drivers.servo_bus.registers import GOAL_POSITION, TORQUE_ENABLE
 from deal_hw.errors import SafetyError
 
 
 def write_beside(wire: Wire, rate_hz: float) -> None:
     """Let another program send the belt servo to one place, again and again."""
-    goal = (wire.cart.block.goal_position + 200).to_bytes(GOAL_POSITION.size, "little", signed=True)
-    head = bytes([GOAL_POSITION.address, 0, GOAL_POSITION.size, 0, wire.cart.id])
-    packet = instruction(BROADCAST, Instruction.SYNC_WRITE, head + goal)
-    tick, due_ns = wire.device._run_tick, wire.clock.now_ns()
-
-    def tick_and_write() -> None:
-        nonlocal due_ns
-        tick()
-        if wire.clock.now_ns() >= due_ns:
-            due_ns += round(1e9 / rate_hz)
-            wire.device.bus.receive_foreign(packet, False)
-
-    wire.device._run_tick = tick_and_write  # type: ignore[method-assign]
+    packet = sync_write(GOAL_POSITION, {wire.cart.id: wire.cart.get(GOAL_POSITION) + 200})
+    faults = BusFaults(foreign_rate_hz=rate_hz)
+    wire.device._other = OtherMaster(packet, wire.device.bus, faults, wire.clock.now_ns())
 
 
 @pytest.mark.parametrize(("rate_hz", "most_ms"), [(200.0, 40), (60.0, 60)])
@@ -62,9 +53,7 @@ def test_a_second_servo_of_one_id_is_named_in_a_run(servo: int, fast: bool) -> N
     wire.device.bus.fast_read = fast
     robot = wire.armed()
     wire.run(5)
-    twin = EmulatedServo(servo, wire.robot.settings.baud_rate)
-    twin.sense(300)
-    wire.device.servos.append(twin)
+    wire.device.servos.append(wire.device.servos[servo - 1].twin())
     start_ns = wire.clock.now_ns()
     states = []
     while not robot.fault:

@@ -4,32 +4,28 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
+from deal_hw.drivers.servo_bus.faults import BusFaults
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
-from deal_hw.sim.robots.hardware_section import TICKS
 
+DOUBLED, FOREIGN = "two servos of one id", "another program writes goals"
+"""Faults of a bus, in words."""
 WAY_TICKS: Final = 200
-"""How far it wants the servo to turn, towards the middle of its ticks: 0.3 rad."""
+"""How far it wants a servo to turn [ticks]: 0.3 rad."""
 
 
 class OtherMaster:
     """Writes one goal to a servo, again and again.
 
     Args:
-        joint: The servo.
-        bus: Its bus.
-        rate_hz: Writes per second.
-        shown: Whether the host receives its packets.
+        packet: The packet that writes it.
+        bus: The servo's bus.
+        faults: How often, and whether the host receives its packets.
         begin_ns: Time of the first write [ns].
     """
 
-    def __init__(
-        self, joint: EmulatedJoint, bus: ServosSide[Any], rate_hz: float, *, shown: bool, begin_ns: int
-    ) -> None:
-        goal = joint.goal
-        way = WAY_TICKS if goal < TICKS // 2 else -WAY_TICKS
-        self._packet, self._bus, self._shown = joint.goal_packet(goal + way), bus, shown
-        self._period_ns, self._next_ns = round(1e9 / rate_hz), begin_ns
+    def __init__(self, packet: bytes, bus: ServosSide[Any], faults: BusFaults, begin_ns: int) -> None:
+        self._packet, self._bus, self._shown = packet, bus, faults.foreign_on_line
+        self._period_ns, self._next_ns = round(1e9 / faults.foreign_rate_hz), begin_ns
 
     def advance(self, now_ns: int) -> bool:
         """Write if it is time to; return whether it was."""
