@@ -52,8 +52,9 @@ class MasterWatch:
     on the line that asks servos and was not sent from here, where the adapter receives such packets.
 
     One sign may be a corrupt byte that passed a checksum. Two within :data:`WINDOW_NS` are another master:
-    two different goals, a goal that is there again after a newer command, or two packets. Another master that
-    writes at least as often as states are read is found with the second or third state that shows it.
+    two different goals, a goal that is there again after a newer command, or again although the servo had
+    taken the newest one, or two packets. Another master that writes at least as often as states are read is
+    found with the second or third state that shows it.
 
     Args:
         goal: The register of the goal.
@@ -71,6 +72,7 @@ class MasterWatch:
         self._signs: deque[int] = deque(maxlen=2)
         self._odd: frozenset[tuple[int, bytes]] = frozenset()
         self._odd_command = -1
+        self._taken: dict[int, int] = {}
         self.commands = 0
         self.sign: ForeignSign | None = None
 
@@ -104,16 +106,19 @@ class MasterWatch:
             return
         odd = set()
         for servo, data in found.items():
-            goal = data[begin : begin + self._goal.size]
-            if len(goal) < self._goal.size or goal == self._ours.get(servo):
+            goal, sent = data[begin : begin + self._goal.size], self._sent.get(servo)
+            if len(goal) < self._goal.size:
                 continue
             # Until the first write is taken, a servo has the goal that it had before.
-            if servo not in self._sent or goal in self._sent[servo]:
+            if sent is None or goal == self._ours.get(servo) or goal in sent:
                 self._ours[servo] = goal
+                if sent and goal == sent[-1]:
+                    self._taken[servo] = commands
             else:
                 odd.add((servo, goal))
-        if not odd or (odd <= self._odd and commands == self._odd_command):
-            # The goals of one corrupt command stay until the next one.
+        # The goals of one corrupt command stay until the next one; those that came after it are no command's.
+        same = commands == self._odd_command and odd <= self._odd
+        if not odd or (same and all(self._taken.get(servo) != commands for servo, _ in odd)):
             return
         self._odd, self._odd_command = frozenset(odd), commands
         servo, goal = min(odd)

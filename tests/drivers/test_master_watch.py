@@ -82,6 +82,15 @@ def test_the_same_goal_after_a_newer_command_is_another_master() -> None:
     assert bus.read(ODD)
 
 
+def test_the_same_goal_after_the_newest_command_was_taken_is_another_master() -> None:
+    """No command of ours can have become it. Once may still be a corrupt answer."""
+    bus = Bus()
+    bus.write(OURS)
+    assert not bus.read(OURS)
+    assert not bus.read(OURS, ODD)
+    assert bus.read(OURS, ODD)
+
+
 def test_a_second_sign_comes_within_some_seconds() -> None:
     """On a line that passes a corrupt byte now and then no run trips."""
     bus = Bus()
