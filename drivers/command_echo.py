@@ -1,4 +1,4 @@
-"""Finds which command was in force when a state was sensed, for robots that do not report it."""
+"""Which command was in force when a state was sensed: found where it is not reported, checked where it is."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import Final
 OFFSET_WINDOW_NS: Final = 1_000_000_000
 """Length of a window [ns]; the offset is the smallest of the present window and the one before.
 An older offset would be wrong after a pause of the robot's computer: its clock then stays behind."""
+
+
+_SIGNS: Final = 2
+"""States with another program's command after which it is known."""
 
 
 class ClockOffset:
@@ -32,6 +36,40 @@ class ClockOffset:
             self._recent_ns, self._window_ns, self._first = offset, receive_ns, False
         self._recent_ns = min(self._recent_ns, offset)
         self.offset_ns = min(self._former_ns, self._recent_ns)
+
+
+class NumberWatch:
+    """Notices that a robot follows a command of another program, by the number that its states report.
+
+    Our numbers grow, and a robot never goes back to an older one. One state may be corrupt; the second with a
+    number that cannot be ours is another program's.
+
+    Attributes:
+        foreign: That number; -1 while all are ours.
+    """
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Expect no command; numbers are judged from the first one that is sent."""
+        self.foreign = self._sent = self._shown = -1
+        self._odd = 0
+
+    def sent(self, number: int) -> None:
+        """Note that a command was sent."""
+        self._sent = number
+
+    def shown(self, number: int) -> None:
+        """Take the number of the command in force in a state; -1 for none."""
+        if self._sent < 0 or number < 0:
+            return
+        if self._shown <= number <= self._sent:
+            self._shown = number
+            return
+        self._odd += 1
+        if self._odd >= _SIGNS and self.foreign < 0:
+            self.foreign = number
 
 
 class CommandEcho:

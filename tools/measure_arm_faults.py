@@ -27,6 +27,7 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.drivers.servo_arm.emulated_families import TROUBLES
 from deal_hw.drivers.servo_arm.families import FAMILIES, OFF, Family
 from deal_hw.drivers.servo_bus.interface import ServoBus
+from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import FrameError, TransportError
 from deal_hw.sim.robots.file_description import file_description
@@ -34,7 +35,9 @@ from deal_hw.sim.robots.robot_file import write_robot_file
 
 SECONDS = 1.5
 ARMED, IDLE, BRAKING, PARTLY, STOPPED = "armed", "idle", "braking", "partly", "stopped"
-BY_ITSELF = ("gone", "cut", "frozen", *TROUBLES)
+BY_ITSELF = ("gone", "cut", "frozen", *TROUBLES, DOUBLED, FOREIGN)
+OF_ONE_SERVO = ("--servo", "--duplicate-id", "--foreign-writer")
+"""Beginnings of the emulator's options for faults of one servo."""
 DYNAMIXEL, FEETECH = ("dynamixel",), ("feetech",)
 ARM = "two joints"
 SERVOS = (1, 2)
@@ -72,7 +75,7 @@ class ArmRig(Rig):
 
     def emulator_options(self) -> list[str]:
         """A port that keeps its name when the cable is put back."""
-        faults_of_servo = any(word.startswith("--servo") for word in self.case.emulator)
+        faults_of_servo = any(word.startswith(OF_ONE_SERVO) for word in self.case.emulator)
         faulty = ["--faulty-servo", str(self.rng.choice(SERVOS))] if faults_of_servo else []
         return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port"), *faulty]
 
@@ -191,6 +194,20 @@ CASES = (
     Case(name="a servo restarts", emulator=after("--servo-reboot-after-s")),
     Case(name="a servo reports overload", emulator=after("--servo-overload-after-s")),
     Case(name="a servo is unplugged", emulator=after("--servo-absent-after-s")),
+    Case(name="a second servo has its id", emulator=after("--duplicate-id-after-s"), codes=(3, 2)),
+    *(
+        # On the way to the start pose the run fails before it began.
+        Case(
+            name=f"another program writes goals {how}",
+            emulator=(*after("--foreign-writer-after-s"), *options),
+            codes=(3, 2),
+        )
+        for how, options in {
+            "60 times a second": (),
+            "30 times a second": ("--foreign-rate-hz", "30"),
+            "60 times a second, by an adapter of its own": ("--foreign-on-line",),
+        }.items()
+    ),
     Case(name="another program switches a servo's torque off", act=take_torque, phases=(RUNNING,)),
     Case(
         name="another program reads the servos",

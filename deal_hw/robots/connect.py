@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.clock import Clock
+from deal_hw.control.process.claim import LocalClaim
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.findings import Finding
 from deal_hw.robots.entry import RobotEntry, TransportEntry, WireEntry
@@ -152,6 +153,19 @@ def on_this_computer(transport_name: str, port: str) -> bool:
     """Return whether a port leads to a program on this computer, such as an emulator: there is no cable."""
     entry = transport_of(transport_name)
     return bool(entry.local and entry.load(entry.local)(port))
+
+
+def spoilt_on_purpose(transport_name: str, port: str, options: WireOptions | None = None) -> LocalClaim:
+    """Return the name that an emulator holds while it spoils frames on purpose.
+
+    Programs that receive its frames ask whether it is held. Then corrupt or lost states have this cause.
+
+    Args:
+        transport_name: How the robot is reached.
+        port: Where.
+        options: More about a transport of topics.
+    """
+    return LocalClaim(f"spoilt frames: {claim_name(transport_name, port, options or WireOptions())}")
 
 
 def carries_topics(transport_name: str) -> bool:

@@ -61,12 +61,23 @@ def late_advice(local: bool, load: Load) -> str:
     return f"{load}, which is no cause; check cable, connectors and wireless"
 
 
-def corrupt_advice(local: bool, load: Load) -> str:
-    """Return the likely cause of corrupt or lost states, and what to do; arguments as :func:`late_advice`."""
+def corrupt_advice(local: bool, load: Load, spoilt: bool = False) -> str:
+    """Return the likely cause of corrupt or lost states, and what to do.
+
+    Args:
+        local: As for :func:`late_advice`.
+        load: This computer's load.
+        spoilt: The emulator says that it spoils frames; see
+            :func:`deal_hw.robots.connect.spoilt_on_purpose`.
+    """
+    if spoilt:
+        return (
+            "the robot is an emulator that spoils frames on purpose: leave its `--corrupt`, `--drop` and "
+            "`--duplicate` out, and its profile `realistic`"
+        )
     if local:
         return (
-            "the robot is a program on this computer (an emulator), so no cable is at fault: it spoils "
-            "frames on purpose (`emulate --profile realistic`, `--corrupt`, `--drop`), or it was late "
-            f"({load})"
+            "the robot is a program on this computer (an emulator), so no cable is at fault: it or this run "
+            f"was late ({load}), or another program uses its port; end other programs and run again"
         )
-    return "check cable, connectors and grounding"
+    return "check cable, connectors and grounding; end other programs that use the port or the bus"

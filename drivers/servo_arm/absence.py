@@ -1,4 +1,4 @@
-"""Finds the servo of a bus that fell silent while others still answer."""
+"""Finds the servo of a bus that fails while the others still answer: it is silent, or two have its id."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from deal_hw.drivers.servo_bus.polled_robot import MISSES
 SILENT_NS: Final = 50_000_000
 """A servo that answers again within this time is not absent [ns]. It is shorter than the 100 ms after which
 the age of the states ends a run, so that the message names the servo."""
+QUIET_NS: Final = 10_000_000_000
+"""A line without corrupt answers of other servos for this long has no noise that hits them all [ns]."""
 
 
 class AbsenceWatch:
@@ -52,3 +54,42 @@ class AbsenceWatch:
             self.order = self.order[::-1]
         absent = self._count >= MISSES and now_ns - self._since_ns >= SILENT_NS
         return silent if absent else None
+
+
+class CollisionWatch:
+    """Follows whose answers are corrupt in requests to all servos.
+
+    Two servos with one id answer at the same time, and spoil each other's answers alone. Noise spoils those
+    of all servos, now of one, now of another.
+
+    Args:
+        ids: The servos, in their usual order.
+        now_ns: Present time [ns].
+    """
+
+    def __init__(self, ids: Sequence[int], now_ns: int) -> None:
+        self._ids = tuple(ids)
+        self._spoilt_ns: dict[int, int] = {}
+        self.answered(now_ns)
+
+    def answered(self, now_ns: int) -> None:
+        """Note at a time [ns] that all of them have answered soundly."""
+        self._suspect, self._count, self._since_ns = -1, 0, now_ns
+
+    def missed(self, answered: Sequence[int], now_ns: int) -> int | None:
+        """Note a request with corrupt answers.
+
+        Args:
+            answered: The ids of those that answered soundly, once each.
+            now_ns: Present time [ns].
+
+        Returns:
+            The servo whose id two have; None while it is not known.
+        """
+        spoilt = next((servo for servo in self._ids if servo not in answered), -1)
+        self._count = self._count + 1 if spoilt == self._suspect else 1
+        self._suspect, self._spoilt_ns[spoilt] = spoilt, now_ns
+        if spoilt < 0 or self._count < MISSES or now_ns - self._since_ns < SILENT_NS:
+            return None
+        others = [at_ns for servo, at_ns in self._spoilt_ns.items() if servo != spoilt]
+        return None if any(now_ns - at_ns < QUIET_NS for at_ns in others) else spoilt

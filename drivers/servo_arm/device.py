@@ -12,12 +12,13 @@ import numpy as np
 from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
 from deal_hw.drivers.servo_arm.faults import ArmFaults
+from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN, WAY_TICKS, OtherMaster
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.robots.hardware_section import RAD, HardwareSection
+from deal_hw.sim.robots.hardware_section import RAD, TICKS, HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
 from deal_hw.testing.joint_faults import FaultyJoints, JointFaults
 from deal_hw.types import FloatArray
@@ -83,6 +84,8 @@ class ArmDevice:
         self._due = self._schedule(faults or ArmFaults())
         self._joint_faults = FaultyJoints(joint_faults or JointFaults(), d.joint_names, d.actuated_index)
         self._first_ns: int | None = None
+        self._other: OtherMaster | None = None
+        self._bus_trouble = ""
         limits = dict(zip(d.actuated, d.effort_limit, strict=True))
         # Without a limit nothing says what share of the voltage an effort takes.
         self._most = [
@@ -155,7 +158,7 @@ class ArmDevice:
     def trouble(self) -> str:
         """Current fault of a servo; "" for none."""
         found = (joint.trouble(self._now_ns) for joint in self.joints)
-        return next((trouble for trouble in found if trouble), self._joint_faults.now)
+        return next((trouble for trouble in found if trouble), self._bus_trouble or self._joint_faults.now)
 
     @property
     def frame_errors(self) -> int:
@@ -204,6 +207,8 @@ class ArmDevice:
             (faults.servo_absent_after_s, lambda: joint.unplug(self._now_ns)),
             (faults.servo_reboot_after_s, lambda: joint.restart(self._now_ns)),
             (faults.servo_overload_after_s, joint.overload),
+            (faults.duplicate_id_after_s, lambda: self._double(joint)),
+            (faults.foreign_writer_after_s, lambda: self._let_write(joint, faults)),
         ]
         return sorted(((at_s, act) for at_s, act in acts if at_s is not None), key=lambda due: due[0])
 
@@ -216,14 +221,28 @@ class ArmDevice:
                 return
             self._due.pop(0)[1]()
 
+    def _double(self, joint: EmulatedJoint) -> None:
+        """Plug in a second servo with a servo's id."""
+        self.bus.servos.append(joint.servo.twin())
+        self._bus_trouble = DOUBLED
+
+    def _let_write(self, joint: EmulatedJoint, faults: ArmFaults) -> None:
+        """Let another program write a servo's goals."""
+        # Towards the middle of its ticks.
+        goal = joint.goal + (WAY_TICKS if joint.goal < TICKS // 2 else -WAY_TICKS)
+        self._other = OtherMaster(joint.goal_packet(goal), self.bus, faults, self._now_ns)
+        self._bus_trouble = FOREIGN
+
     def _step(self) -> None:
         now_ns = self._tick * self._tick_ns
         if self._due:
             self._fail()
         if self.armed:
             self._joint_faults.begin(now_ns)
-        if self._joint_faults.advance(now_ns):
+        if self._joint_faults.advance(now_ns) is not None:
             self._stale = True
+        if self._other is not None and self._other.advance(now_ns):
+            self._take_goals(now_ns)
         for joint in self.joints:
             joint.tick(now_ns, now_ns - self.bus.alive_ns)
         while self._coming and self._coming[0][0] <= self._tick:

@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 from deal_hw.drivers.servo_arm.families import OFF, ON, Dynamixel, Feetech, LoopGains
+from deal_hw.drivers.servo_bus import packets, xl330
 from deal_hw.drivers.servo_bus import registers as r
-from deal_hw.drivers.servo_bus import xl330
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
 from deal_hw.drivers.servo_bus.emulated_servo import OVERLOAD_ERROR, EmulatedServo
 from deal_hw.drivers.servo_bus.feetech import registers as f
 from deal_hw.drivers.servo_bus.feetech.emulated_bus import StsBus
 from deal_hw.drivers.servo_bus.feetech.emulated_servo import StsServo
-from deal_hw.drivers.servo_bus.feetech.packets import Fault
+from deal_hw.drivers.servo_bus.feetech.packets import BROADCAST, Fault, StsInstruction, encode
 from deal_hw.drivers.servo_bus.registers import OperatingMode
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.sim.robots.hardware_section import ServoEntry
@@ -105,6 +105,10 @@ class EmulatedJoint(abc.ABC):
     def overload(self) -> None:
         """Report an overload whose cause stays."""
 
+    @abc.abstractmethod
+    def goal_packet(self, ticks: int) -> bytes:
+        """Return the packet by which another master writes its goal."""
+
 
 class DynamixelJoint(EmulatedJoint):
     """An emulated X-series servo.
@@ -168,6 +172,10 @@ class DynamixelJoint(EmulatedJoint):
         """Report an overload; it gives no torque until it restarts."""
         self.servo.fail(OVERLOAD_ERROR)
 
+    def goal_packet(self, ticks: int) -> bytes:
+        """Return a sync write of Goal Position."""
+        return packets.sync_write(r.GOAL_POSITION, {self.servo.id: ticks})
+
 
 class StsJoint(EmulatedJoint):
     """An emulated STS servo, with the homing offset 0.
@@ -223,6 +231,12 @@ class StsJoint(EmulatedJoint):
     def overload(self) -> None:
         """Report an overload; it holds with Protective Torque until it restarts."""
         self.servo.fail(Fault.OVERLOAD, lasting=True)
+
+    def goal_packet(self, ticks: int) -> bytes:
+        """Return a sync write of Goal Position."""
+        goal = f.GOAL_POSITION
+        data = bytes([goal.address, goal.size, self.servo.id]) + f.encode(goal, ticks)
+        return encode(BROADCAST, StsInstruction.SYNC_WRITE, data)
 
 
 EmulatedArm: TypeAlias = tuple[Sequence[EmulatedJoint], ServosSide[Any]]

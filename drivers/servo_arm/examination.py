@@ -114,6 +114,8 @@ class ArmExamination:
             self.surely(servo, checked)
             model = self._family.model_name(found[servo.id].model)
             phrases.append(f"{servo.joint}: servo {servo.id}, {model}, firmware {found[servo.id].firmware}")
+        if self._bus.echoes:
+            phrases.append("the adapter returns this computer's own packets, which are left out")
         return ArmInfo("; ".join(phrases))
 
     def _check_speed(self) -> None:

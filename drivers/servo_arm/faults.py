@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from deal_hw.ranges import Checked, Range
+from deal_hw.drivers.servo_bus.faults import BusFaults
+from deal_hw.ranges import Range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ArmFaults(Checked):
-    """Faults of one servo of an emulated arm, whose times count from the first torque on all motors."""
+class ArmFaults(BusFaults):
+    """Faults of one servo of an emulated arm, and of its bus."""
 
     faulty_servo: Annotated[int | None, Range(0, 253)] = None
     """Id of the servo that has the faults; by default that of the last joint."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -10,12 +10,18 @@ import numpy as np
 from deal_hw.clock import Clock
 from deal_hw.control.safety.following import FollowingWatch
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.servo_arm.absence import AbsenceWatch
+from deal_hw.drivers.servo_arm.absence import AbsenceWatch, CollisionWatch
 from deal_hw.drivers.servo_arm.commands import CommandCodec, Registers, clipped
 from deal_hw.drivers.servo_arm.examination import ArmExamination, ArmInfo
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON, Family, ServoSample
-from deal_hw.drivers.servo_bus.interface import BITS_PER_BYTE, ServoBus, SilentServosError, Writes
-from deal_hw.drivers.servo_bus.polled_robot import PolledRobot, status_of
+from deal_hw.drivers.servo_bus.interface import (
+    BITS_PER_BYTE,
+    ServoBus,
+    SilentServosError,
+    SpoiltAnswerError,
+    Writes,
+)
+from deal_hw.drivers.servo_bus.polled_robot import PolledRobot, status_of, two_servos
 from deal_hw.drivers.servo_bus.samples import SampleGrid
 from deal_hw.errors import FrameError, SafetyError, TransportTimeoutError
 from deal_hw.motions.behaviours import position_command
@@ -111,6 +117,7 @@ class ServoArm(PolledRobot[ServoBus]):
         self._written: Registers | None = None
         self._begin_ns = self._clock.now_ns()
         self._absence = AbsenceWatch(self._ids, self._begin_ns)
+        self._collision = CollisionWatch(self._ids, self._begin_ns)
         self._newest: dict[int, ServoSample] = {}
         self._newest_ns = self._unsound = 0
         self._doubted = False
@@ -231,11 +238,9 @@ class ServoArm(PolledRobot[ServoBus]):
         watch, index = FollowingWatch(self.description), list(self.description.actuated_index)
         fastest = min(_HOMING_RAD_S, *(0.5 * v for v in self.description.limits.trip_velocity))
         steps = max(round(np.abs(end - start).max() / fastest * self.description.state_rate_hz), 1)
-        step = 0
+        step, target = 0, start
         while True:
-            step = min(step + 1, steps)
-            target = start + (end - start) * step / steps
-            self._bus.post(self._family.goals(self._codec.goals(target)))
+            # Before the next goals are sent: these would hide the goals of another program.
             samples = self._samples(self._clock.now_ns() + _PATIENCE_NS)
             self._judge(samples)
             if self._fault:
@@ -254,6 +259,9 @@ class ServoArm(PolledRobot[ServoBus]):
                     f"{self.description.name}: joint {self._servos[worst].joint} is still {off[worst]:.2f} "
                     "rad from its pose: it is blocked, or its gain is too low to carry the arm"
                 )
+            step = min(step + 1, steps)
+            target = start + (end - start) * step / steps
+            self._bus.post(self._family.goals(self._codec.goals(target)))
             self._clock.sleep_until_ns(self._poller.asked_ns + self._period_ns)
 
     def _clear_faults(self, end_ns: int) -> dict[int, ServoSample]:
@@ -281,8 +289,8 @@ class ServoArm(PolledRobot[ServoBus]):
                 self._poller.asked_ns = self._bus.ask(self._absence.order, address, size)
                 found = self._bus.take(end_ns)
             except (SilentServosError, FrameError) as error:
-                if absent := self._absent(error):
-                    raise TransportTimeoutError(f"{self._where}: {absent}") from error
+                if why := self._named(error):
+                    raise TransportTimeoutError(f"{self._where}: {why}") from error
                 failures += 1
                 now_ns = self._clock.now_ns()
                 if now_ns >= end_ns or (failures >= _MOST_FAILURES and now_ns >= patient_ns):
@@ -292,7 +300,8 @@ class ServoArm(PolledRobot[ServoBus]):
             if found is None:
                 raise TransportTimeoutError(f"{self._where}: the servos do not answer in time")
             self._poller.answered()
-            self._absence.answered(self._clock.now_ns())
+            if why := self._answered():
+                raise SafetyError(f"{self._where}: {why}")
             return {i: self._family.sample(i, data) for i, data in found.items()}
 
     # States.
@@ -308,20 +317,21 @@ class ServoArm(PolledRobot[ServoBus]):
             found = self._bus.take(deadline_ns)
         except (SilentServosError, FrameError) as error:
             self._asked = ()
-            if absent := self._absent(error):
-                self._latch(absent)
+            self._latch(self._named(error))
             return
         if found is None:
             return
         asked, self._asked = self._asked, ()
         self._poller.answered()
-        self._absence.answered(self._clock.now_ns())
+        why = self._answered()
         if asked != self._ids:
             # In the other order the times of the servos' turns are others.
             return
         samples = {i: self._family.sample(i, data) for i, data in found.items()}
         if self._sound(samples):
             self._receive(samples)
+            # A servo's own fault comes first: one that restarts has a goal that nobody sent.
+            self._latch(why)
         else:
             self._unsound += 1
 
@@ -347,21 +357,46 @@ class ServoArm(PolledRobot[ServoBus]):
         self._doubted = False
         return True
 
-    def _absent(self, error: SilentServosError | FrameError) -> str:
-        """Return which servo is absent after a failed request, and what to do; "" while it is not known.
+    def _answered(self) -> str:
+        """Note that all servos answered; return what is wrong with the bus all the same, or ""."""
+        now_ns = self._clock.now_ns()
+        self._absence.answered(now_ns)
+        if not self._bus.doubled:
+            self._collision.answered(now_ns)
+            return self._foreign()
+        return self._foreign() or self._collided([i for i in self._ids if i not in self._bus.doubled])
 
-        While none answers, it is the cable or the supply of all, and states grow old.
+    def _named(self, error: SilentServosError | FrameError) -> str:
+        """Return what a failed request shows, and what to do; "" while it is not known.
+
+        While no servo answers, it is the cable or the supply of all, and states grow old.
         """
+        if foreign := self._foreign():
+            return foreign
+        if isinstance(error, SpoiltAnswerError):
+            return self._collided(error.answered)
         if not isinstance(error, SilentServosError):
             return ""
         absent = self._absence.missed(error.answered, self._clock.now_ns())
         if absent is None:
             return ""
-        joint = next(servo.joint for servo in self._servos if servo.id == absent)
         return (
-            f"servo {absent} ({joint}) stopped answering: it restarted, or lost its supply or its cable. "
-            "Check both, end other programs on the bus, then start again"
+            f"servo {absent} ({self._joint(absent)}) stopped answering: it restarted, or lost its supply or "
+            "its cable. Check both, end other programs on the bus, then start again"
         )
+
+    def _collided(self, answered: Sequence[int]) -> str:
+        """Return of which servo alone the answers are corrupt, by those that answered soundly."""
+        servo = self._collision.missed(answered, self._clock.now_ns())
+        return "" if servo is None else two_servos(servo, self._joint(servo))
+
+    def _foreign(self) -> str:
+        """Return that another program commands the servos, and what to do; "" if none does."""
+        sign = self._bus.watch.sign
+        return "" if sign is None else sign.text("" if sign.servo is None else self._joint(sign.servo))
+
+    def _joint(self, servo: int) -> str:
+        return next(one.joint for one in self._servos if one.id == servo)
 
     def _receive(self, samples: Mapping[int, ServoSample]) -> None:
         self._judge(samples)

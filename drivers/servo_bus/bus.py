@@ -9,30 +9,34 @@ gets them when the last packet is complete.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 from deal_hw.clock import Clock
+from deal_hw.drivers.servo_bus import packets
 from deal_hw.drivers.servo_bus.interface import (
+    BROADCAST,
     Answer,
     Port,
     ServoBus,
     SilentServosError,
+    SpoiltAnswerError,
     WantedAnswer,
     Writes,
 )
-from deal_hw.drivers.servo_bus.registers import Register
+from deal_hw.drivers.servo_bus.master_watch import MasterWatch
+from deal_hw.drivers.servo_bus.registers import GOAL_POSITION, Register
 from deal_hw.drivers.servo_bus.sdk import COMM_SUCCESS, PacketHandler, Protocol2PacketHandler
 from deal_hw.errors import DealHwError, FrameError, ProtocolError, TransportTimeoutError
 from deal_hw.transport import Transport
 
 HEADER: Final = b"\xff\xff\xfd\x00"
-_BROADCAST: Final = 0xFE
 _SYNC_READ, _FAST_SYNC_READ, _STATUS = 0x82, 0x8A, 0x55
 _STATUS_BYTES = 11
 """A status packet without data: header 4, id, length 2, instruction, error, CRC 2."""
 _PING_BYTES = _STATUS_BYTES + 3
 _ALERT = 0x80
+_INSTRUCTIONS: Final = frozenset(packets.Instruction)
 _STUFFING_BYTES = 16
 """Additional bytes that a group's answer has time for."""
 
@@ -125,8 +129,12 @@ class Bus(ServoBus):
     _port: _Port
 
     def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
-        super().__init__(_Port(transport, clock, baud_rate, answer_s), clock)
+        super().__init__(
+            _Port(transport, clock, baud_rate, answer_s), clock, MasterWatch(GOAL_POSITION, _signed)
+        )
         self._sdk: Any = _Packets()
+        self._line = packets.PacketParser()
+        self._chained = False
 
     def ping(self, servo: int) -> Answer:
         """Return model and firmware of a servo.
@@ -155,7 +163,7 @@ class Bus(ServoBus):
     def broadcast_ping(self, seconds: float) -> dict[int, Answer]:
         """Return all servos that answer a broadcast ping within a time [s]."""
         self._port.drop()
-        self._sdk.txPacket(self._port, [0, 0, 0, 0, _BROADCAST, 3, 0, 1, 0, 0])
+        self._sdk.txPacket(self._port, [0, 0, 0, 0, BROADCAST, 3, 0, 1, 0, 0])
         self._port.flush()
         self._port.setPacketTimeoutMillis(1e3 * seconds)
         found: dict[int, Answer] = {}
@@ -197,6 +205,17 @@ class Bus(ServoBus):
                 f"servo {servo} refuses {value} in its register {register.name} ({register.address}): {text}"
             )
 
+    def _find_requests(self, data: bytes) -> None:
+        for packet in self._line.feed(data):
+            whole = packets.instruction(packet.servo, packet.instruction, packet.params)
+            # A group's answer is counted by its packets.
+            if (at := self._port.buffer.find(whole)) >= 0:
+                del self._port.buffer[at : at + len(whole)]
+            if self._port.sent(whole):
+                self.echoes = True
+            elif packet.instruction in _INSTRUCTIONS:
+                self._note_request(packets.Instruction(packet.instruction).name, packet.servo)
+
     def _put_writes(self, writes: Writes) -> None:
         for address, values in writes:
             size = len(next(iter(values.values())))
@@ -217,28 +236,23 @@ class Bus(ServoBus):
     def _collect(self, wanted: WantedAnswer) -> dict[int, bytes] | None:
         if not self._whole(wanted):
             return None
-        self._port.expire()
-        try:
-            return self._fast_answer(wanted) if wanted.fast else self._answers(wanted)
-        except (IndexError, FrameError) as error:
-            raise FrameError(f"the answer of servos {wanted.ids} is corrupt") from error
+        found, sound = self._fast_answer(wanted) if wanted.fast else self._answers(wanted)
+        if not sound or len(found) < len(wanted.ids):
+            raise self._spoilt(wanted, found)
+        return {servo: found[servo] for servo in wanted.ids}
 
     def _incomplete(self, wanted: WantedAnswer) -> DealHwError:
-        corrupt = FrameError(f"the answer of servos {wanted.ids} is corrupt or incomplete")
         if wanted.fast and self._port.buffer:
-            return corrupt
-        answered = []
-        self._port.expire()
-        while self._port.buffer:
-            try:
-                packet, result = self._sdk.rxPacket(self._port, False)
-            except IndexError:
-                return corrupt
-            if result != COMM_SUCCESS or packet[4] not in wanted.ids:
-                return corrupt
-            answered.append(packet[4])
-        silent = [servo for servo in wanted.ids if servo not in answered]
-        return SilentServosError(silent, answered) if silent else corrupt
+            return self._spoilt(wanted)
+        found, sound = self._answers(wanted)
+        silent = [servo for servo in wanted.ids if servo not in found]
+        if not sound or not silent:
+            return self._spoilt(wanted, found)
+        return SilentServosError(silent, list(found))
+
+    def _spoilt(self, wanted: WantedAnswer, found: Iterable[int] = ()) -> SpoiltAnswerError:
+        text = f"the answer of servos {wanted.ids} is corrupt or incomplete"
+        return SpoiltAnswerError(text, [servo for servo in found if servo not in self.doubled])
 
     def _whole(self, answer: WantedAnswer) -> bool:
         """Return whether the buffer contains all requested packets; the SDK checks their content."""
@@ -253,29 +267,56 @@ class Bus(ServoBus):
             wanted -= 1
         return True
 
-    def _fast_answer(self, wanted: WantedAnswer) -> dict[int, bytes]:
-        packet, result = self._sdk.rxPacket(self._port, True)
-        if result != COMM_SUCCESS or packet[4] != _BROADCAST or packet[7] != _STATUS:
-            raise FrameError("no sound packet")
-        if len(packet) > self.answer_bytes(len(wanted.ids), wanted.size, True):
+    def _fast_answer(self, wanted: WantedAnswer) -> tuple[dict[int, bytes], bool]:
+        """Return the sound parts of the one packet in the buffer, and whether the packet itself is sound."""
+        self._port.expire()
+        try:
+            packet, result = self._sdk.rxPacket(self._port, True)
+        except IndexError:
+            return {}, False
+        if result != COMM_SUCCESS or packet[4] != BROADCAST or packet[7] != _STATUS:
+            return {}, False
+        stuffed = len(packet) > self.answer_bytes(len(wanted.ids), wanted.size, True)
+        if stuffed:
             # The SDK expects such answers without stuffing; the length shows whether a servo stuffs them.
             packet = self._sdk.removeStuffing(packet)
-        found = {}
+        whole, found, wrong = bytes(packet), dict[int, bytes](), set[int]()
         for k, servo in enumerate(wanted.ids):
             at = 8 + k * (wanted.size + 4)
-            if packet[at + 1] != servo:
-                raise FrameError("another servo's answer")
-            found[servo] = bytes(packet[at + 2 : at + 2 + wanted.size])
-        return _sized(found, wanted.size)
+            end = at + 2 + wanted.size
+            if len(whole) < end + 2 or whole[at + 1] != servo:
+                return found, False
+            if not stuffed and packets.crc(whole[:end]) != int.from_bytes(whole[end : end + 2], "little"):
+                wrong.add(servo)
+            found[servo] = whole[at + 2 : end]
+        # The SDK checks the last CRC, which its servo makes of all bytes before as they came. So those of the
+        # other servos count, too, where they were once seen to be made so.
+        self._chained = self._chained or not (wrong or stuffed)
+        if self._chained:
+            found = {servo: data for servo, data in found.items() if servo not in wrong}
+        return found, True
 
-    def _answers(self, wanted: WantedAnswer) -> dict[int, bytes]:
-        found = {}
-        for servo in wanted.ids:
-            packet, result = self._sdk.rxPacket(self._port, False)
-            if result != COMM_SUCCESS or packet[4] != servo:
-                raise FrameError("no sound packet")
-            found[servo] = bytes(packet[9 : 9 + wanted.size])
-        return _sized(found, wanted.size)
+    def _answers(self, wanted: WantedAnswer) -> tuple[dict[int, bytes], bool]:
+        """Return the sound answers in the buffer by id, and whether all of it was sound.
+
+        A packet with a wrong CRC is skipped by its length, so the next one is found.
+        """
+        found, twice, all_sound = dict[int, bytes](), set[int](), True
+        self._port.expire()
+        while self._port.buffer and len(found) < len(wanted.ids):
+            try:
+                packet, result = self._sdk.rxPacket(self._port, False)
+            except IndexError:
+                packet, result = [], -1
+            data = bytes(packet[9 : 9 + wanted.size])
+            if result != COMM_SUCCESS or packet[4] not in wanted.ids or len(data) != wanted.size:
+                all_sound = False
+                continue
+            if packet[4] in found:
+                twice.add(packet[4])
+            found[packet[4]] = data
+        self.doubled = frozenset(twice)
+        return found, all_sound
 
     def _check(self, servo: int, result: int, whole: bool = True) -> None:
         if result == COMM_SUCCESS and whole:
@@ -287,7 +328,5 @@ class Bus(ServoBus):
         raise FrameError(f"servo {servo}: {text or 'a short answer'}")
 
 
-def _sized(found: dict[int, bytes], size: int) -> dict[int, bytes]:
-    if any(len(data) != size for data in found.values()):
-        raise FrameError("too short")
-    return found
+def _signed(data: bytes) -> int:
+    return int.from_bytes(data, "little", signed=True)

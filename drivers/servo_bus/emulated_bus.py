@@ -34,7 +34,8 @@ class EmulatedBus(ServosSide[EmulatedServo]):
     """The servos' side of a bus.
 
     Packets are handled on arrival. An answer leaves after the time of request and answer on a wire of the
-    servo's baud rate, plus its return delay.
+    servo's baud rate, plus its return delay. Two servos with one id answer at the same time. Assumed, as no
+    source says it: those behind them in a group take what they receive for an answer, and go on.
 
     Attributes:
         fast_read: Whether they know Fast Sync and Bulk Read; older firmware does not.
@@ -70,6 +71,15 @@ class EmulatedBus(ServosSide[EmulatedServo]):
         for packet in self._parser.feed(data):
             self.alive_ns = self.now_ns
             self._handle(packet)
+
+    def receive_foreign(self, packet: bytes, shown: bool) -> None:
+        """Take a whole packet of another master; it keeps the servos' watchdogs quiet, too."""
+        if shown and self.servos:
+            wire_ns = round(BITS_PER_BYTE * len(packet) / self.servos[0].baud_rate * 1e9)
+            self._replies.append((self._free_ns + wire_ns, packet))
+        self.alive_ns = self.now_ns
+        for request in PacketParser().feed(packet):
+            self._handle(request)
 
     def _listeners(self, servo: int) -> list[EmulatedServo]:
         return [s for s in self.servos if s.protocol == 2 and self._hears(s) and servo in (s.id, BROADCAST)]
@@ -169,12 +179,13 @@ class EmulatedBus(ServosSide[EmulatedServo]):
             speaker = listeners[0]
             if not fast:
                 self.sense(servo, self._free_ns)
-            error, data = speaker.read(address, size)
-            if error:
+            answers = [(s, *s.read(address, size)) for s in listeners]
+            if any(error for _, error, _ in answers):
                 return
-            parts.append((servo, error | speaker.alert, data))
+            said = [(servo, error | s.alert, data) for s, error, data in answers]
+            parts += said
             if not fast:
-                self._send(packet, speaker, status(*parts[-1]))
+                self._send(packet, speaker, at_once(status(*part) for part in said))
         if fast and speaker is not None:
             self._send(packet, speaker, fast_status(parts, sum(size + 4 for _, _, size in wanted)))
 

@@ -21,6 +21,7 @@ from deal_hw.drivers.servo_bus.registers import (
     OperatingMode,
     Register,
 )
+from deal_hw.drivers.servo_bus.servos_side import TWIN_TICKS
 
 BOOT_NS: Final = 300_000_000
 """How long a starting servo is silent [ns]."""
@@ -73,6 +74,15 @@ class EmulatedServo:
         ):
             self.put(register, value)
         self._start()
+
+    def twin(self) -> EmulatedServo:
+        """Return another servo with the same id, without torque, which stands elsewhere."""
+        twin = EmulatedServo(
+            self.id, self.baud_rate, mode=self.get(r.OPERATING_MODE), model=self.get(r.MODEL_NUMBER)
+        )
+        twin.sense(self._shaft + TWIN_TICKS)
+        twin.forget_turns()
+        return twin
 
     def get(self, register: Register) -> int:
         """Return a register, with its sign if a host may write negative values."""

@@ -7,19 +7,24 @@ from __future__ import annotations
 
 import abc
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple, TypeAlias
 
 from deal_hw.clock import Clock
+from deal_hw.drivers.servo_bus.master_watch import MasterWatch
 from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
 from deal_hw.transport import Message, Transport
 
 BITS_PER_BYTE: Final = 10
 """On the wire: start bit, 8 data bits, stop bit."""
+BROADCAST: Final = 0xFE
+"""Id by which all servos are asked."""
 _QUEUE: Final = 4096
 _SILENCE_NS: Final = 20_000_000
 """Silence after a failed request, beyond which no late answer to it is expected [ns]."""
+_ECHOES: Final = 64
+"""Messages that are remembered, to tell their echo from another master's packets."""
 _MOST_LATE: Final = 100
 """Messages that are discarded at most after a failed request."""
 
@@ -35,12 +40,23 @@ class Answer(NamedTuple):
 
 
 class WantedAnswer(NamedTuple):
-    """A requested answer: servos, bytes of each, whether in one packet, deadline [ns]."""
+    """A requested answer.
+
+    Attributes:
+        ids: The servos.
+        address: The first register.
+        size: Bytes of each servo.
+        fast: Whether they come in one packet.
+        until_ns: Deadline [ns].
+        commands: Commands that were written before it, as the bus' watch counts them.
+    """
 
     ids: tuple[int, ...]
+    address: int
     size: int
     fast: bool
     until_ns: int
+    commands: int
 
 
 class SilentServosError(TransportTimeoutError):
@@ -60,6 +76,22 @@ class SilentServosError(TransportTimeoutError):
         super().__init__(f"servos {tuple(silent)} do not answer{others}")
 
 
+class SpoiltAnswerError(FrameError):
+    """The answers of a group are corrupt.
+
+    Attributes:
+        answered: The ids of those servos that answered soundly, once.
+
+    Args:
+        text: What is wrong.
+        answered: Those ids.
+    """
+
+    def __init__(self, text: str, answered: Sequence[int] = ()) -> None:
+        self.answered = tuple(answered)
+        super().__init__(text)
+
+
 class Port:
     """Sends and receives the bytes of a bus.
 
@@ -68,6 +100,7 @@ class Port:
         answer_s: Additional time for an answer [s].
         wire: Messages sent and received; the newest few thousand.
         buffer: Received bytes that nobody has read.
+        observer: Called with all bytes as they are received, also those that are discarded later.
         received_bytes: Received bytes so far, valid or not.
         stamp_ns: Time of the newest bytes [ns].
 
@@ -84,6 +117,8 @@ class Port:
         self.buffer = bytearray()
         self.written = bytearray()
         self.received_bytes = self.stamp_ns = 0
+        self.observer: Callable[[bytes], None] = lambda data: None
+        self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self._transport, self._clock = transport, clock
 
     def answer_ns(self, length: int) -> int:
@@ -99,8 +134,13 @@ class Port:
         if self.written:
             data, self.written = bytes(self.written), bytearray()
             message = Message("tx", data, self._clock.now_ns())
+            self._sent.append(data)
             self._transport.send(Message("", data, message.stamp_ns))
             self.wire.append(message)
+
+    def sent(self, packet: bytes) -> bool:
+        """Return whether a packet is one of those that were sent last."""
+        return any(packet in data for data in self._sent)
 
     def receive(self, deadline_ns: int) -> bool:
         """Wait for bytes; return whether any arrived."""
@@ -112,6 +152,7 @@ class Port:
         self.received_bytes += len(message.payload)
         self.stamp_ns = message.stamp_ns
         self.wire.append(Message("rx", message.payload, message.stamp_ns))
+        self.observer(message.payload)
         return True
 
     def drop(self) -> None:
@@ -129,17 +170,35 @@ class ServoBus(abc.ABC):
 
     Attributes:
         errors: Corrupt or missing answers so far.
+        watch: Recognises another master by what is written and read here.
+        echoes: Whether the adapter returns this computer's own packets.
+        doubled: Servos that answered the newest request to a group twice.
 
     Args:
         port: The port.
         clock: The clock of its stamps.
+        watch: Made for the servos' register of the goal.
     """
 
-    def __init__(self, port: Port, clock: Clock) -> None:
+    def __init__(self, port: Port, clock: Clock, watch: MasterWatch) -> None:
         self.errors = 0
+        self.watch, self.echoes = watch, False
+        self.doubled: frozenset[int] = frozenset()
         self._clock = clock
         self._port = port
+        port.observer = self._find_requests
         self._wanted: deque[WantedAnswer] = deque()
+
+    @abc.abstractmethod
+    def _find_requests(self, data: bytes) -> None:
+        """Look for packets that ask servos in received bytes: echoes of our own, and another master's."""
+
+    def _note_request(self, instruction: str, servo: int) -> None:
+        """Take another master's packet: the name of its instruction, and whom it asks."""
+        whom = "all servos" if servo == BROADCAST else f"servo {servo}"
+        self.watch.request(
+            f"a packet ({instruction.lower().replace('_', ' ')}) to {whom}", self._clock.now_ns()
+        )
 
     @property
     def received_bytes(self) -> int:
@@ -192,7 +251,7 @@ class ServoBus(abc.ABC):
         Args:
             writes: Sync writes, in order: an address, and the bytes of each servo.
         """
-        self._put_writes(writes)
+        self._write_all(writes)
         now_ns = self._clock.now_ns()
         self._port.flush()
         return now_ns
@@ -219,12 +278,13 @@ class ServoBus(abc.ABC):
         """
         if not behind:
             self._forget()
-        self._put_writes(writes)
+        self._write_all(writes)
         self._put_group_read(servos, address, size, fast)
         within_ns = self._port.answer_ns(self._wire_bytes(len(servos), size, fast))
         now_ns = self._clock.now_ns()
         self._port.flush()
-        self._wanted.append(WantedAnswer(tuple(servos), size, fast, now_ns + within_ns))
+        commands = self.watch.commands
+        self._wanted.append(WantedAnswer(tuple(servos), address, size, fast, now_ns + within_ns, commands))
         return now_ns
 
     def take(self, deadline_ns: int) -> dict[int, bytes] | None:
@@ -251,6 +311,7 @@ class ServoBus(abc.ABC):
             self._wanted.popleft()
             raise
         self._wanted.popleft()
+        self.watch.read(wanted.address, found, wanted.commands, self._clock.now_ns())
         return found
 
     def settle(self) -> None:
@@ -268,6 +329,11 @@ class ServoBus(abc.ABC):
         """Discard received bytes and the answers that were still wanted."""
         self._port.drop()
         self._wanted.clear()
+
+    def _write_all(self, writes: Writes) -> None:
+        self._put_writes(writes)
+        for address, values in writes:
+            self.watch.wrote(address, values)
 
     @abc.abstractmethod
     def _put_writes(self, writes: Writes) -> None:

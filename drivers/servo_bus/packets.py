@@ -7,10 +7,15 @@ sides check each other.
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from fastcrc import crc16
+
+from deal_hw.drivers.servo_bus.registers import Register
+from deal_hw.drivers.servo_bus.servos_side import at_once
 
 HEADER: Final = b"\xff\xff\xfd\x00"
 BROADCAST: Final = 0xFE
@@ -82,6 +87,14 @@ def instruction(servo: int, code: int, params: bytes = b"") -> bytes:
     return packet(servo, bytes([code]) + params)
 
 
+def sync_write(register: Register, values: Mapping[int, int]) -> bytes:
+    """Return the instruction packet that writes a register of several servos, by their ids."""
+    params = register.address.to_bytes(2, "little") + register.size.to_bytes(2, "little")
+    for servo, value in values.items():
+        params += bytes([servo]) + value.to_bytes(register.size, "little", signed=value < 0)
+    return instruction(BROADCAST, Instruction.SYNC_WRITE, params)
+
+
 def status(servo: int, error: int, data: bytes = b"") -> bytes:
     """Return a status packet."""
     return packet(servo, bytes([_STATUS, error]) + data)
@@ -94,13 +107,13 @@ def fast_status(parts: Sequence[tuple[int, int, bytes]], expected: int) -> bytes
     If a requested servo is absent, the packet ends before its part and is shorter than its length field says.
 
     Args:
-        parts: Id, error and data of each servo that answers, in order.
+        parts: Id, error and data of each servo that answers, in order. Those with one id answer at once.
         expected: Bytes of all requested parts: data, and four more bytes for each servo.
     """
     out = HEADER + bytes([BROADCAST]) + (1 + expected).to_bytes(2, "little") + bytes([_STATUS])
-    for servo, error, data in parts:
-        out += bytes([error, servo]) + data
-        out += crc(out).to_bytes(2, "little")
+    for servo, answers in groupby(parts, key=itemgetter(0)):
+        bodies = [bytes([error, servo]) + data for _, error, data in answers]
+        out += at_once(body + crc(out + body).to_bytes(2, "little") for body in bodies)
     return out
 
 

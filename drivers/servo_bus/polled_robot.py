@@ -66,6 +66,7 @@ class PolledRobot(Robot, Generic[BusT]):
                 "servos answer only to requests, but a dry run sends nothing; leave --dry-run out"
             )
         self._transport.open()
+        self._bus.watch.restart()
         try:
             info = self._examine()
             self._forget()
@@ -163,6 +164,7 @@ class PolledRobot(Robot, Generic[BusT]):
         """Discard the states received before and an answer that is on its way; the motors are not stopped."""
         self._states.clear()
         self._armed = False
+        self._bus.watch.restart()
         if self._expects:
             self._expect_nothing()
             self._poller.withdraw()
@@ -191,6 +193,20 @@ class PolledRobot(Robot, Generic[BusT]):
         wire = list(self._bus.wire)
         self._bus.wire.clear()
         return wire
+
+
+def two_servos(servo: int, part: str) -> str:
+    """Return that the answers of one servo alone are corrupt, what this means, and what to do.
+
+    Args:
+        servo: Its id.
+        part: Its joint or part.
+    """
+    return (
+        f"two servos answer as id {servo} ({part}), or its plug is loose: its answers are corrupt, those of "
+        "the others are not. Unplug the servo that was added, or check the plug; give each servo an id of "
+        "its own, then start again"
+    )
 
 
 def status_of(flags: Mapping[Status, object]) -> Status:

@@ -7,9 +7,12 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from functools import reduce
 from operator import and_
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from deal_hw.drivers.servo_bus.registers import Register
+
+TWIN_TICKS: Final = 700
+"""How far a second servo with one's id stands from it."""
 
 
 class ListeningServo(Protocol):
@@ -83,6 +86,15 @@ class ServosSide(abc.ABC, Generic[ServoT]):
     @abc.abstractmethod
     def receive(self, data: bytes) -> None:
         """Take bytes from the host and handle the requests that they complete."""
+
+    @abc.abstractmethod
+    def receive_foreign(self, packet: bytes, shown: bool) -> None:
+        """Take a whole packet of another master.
+
+        Args:
+            packet: Its bytes.
+            shown: Whether the host receives it, too.
+        """
 
     def _advance(self) -> None:
         """Let what the servos do by themselves follow the time, where the owner does not."""

@@ -168,14 +168,16 @@ def test_a_cable_that_is_out_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "multicast on" in found[1].do
 
 
-def listened(drop: float = 0.0, corrupt: float = 0.0, local: bool = False) -> list[Finding]:
+def listened(
+    drop: float = 0.0, corrupt: float = 0.0, local: bool = False, spoilt: bool = False
+) -> list[Finding]:
     """Return what is found on an emulated cart-pole that loses or spoils a share of its frames."""
     clock = VirtualClock()
     faults = FrameFaults(FaultRates(drop=drop, corrupt=corrupt), np.random.default_rng(0))
     wire = FaultyTransport(
         VirtualTransport(CartpoleDevice(nominal_truth("ideal")), clock), faults, clock=clock
     )
-    return list(examine_robot("cartpole", CartpoleRobot(wire, clock), clock, 2.0, local))
+    return list(examine_robot("cartpole", CartpoleRobot(wire, clock), clock, 2.0, local, spoilt))
 
 
 def test_a_serial_robot_is_greeted_and_listened_to() -> None:
@@ -194,14 +196,14 @@ def test_a_bad_serial_cable_is_a_warning() -> None:
     assert all("cable" in f.do for f in found[:2])
 
 
-@pytest.mark.parametrize("local", [False, True])
-def test_a_link_on_which_no_run_lasts_is_a_failure(local: bool) -> None:
+@pytest.mark.parametrize(("local", "spoilt"), [(False, False), (True, False), (True, True)])
+def test_a_link_on_which_no_run_lasts_is_a_failure(local: bool, spoilt: bool) -> None:
     """Three frames of ten corrupt, 46 % of the states: the exit code says so; an emulator has no cable."""
-    found = listened(corrupt=0.3, local=local)
+    found = listened(corrupt=0.3, local=local, spoilt=spoilt)
     assert DoctorReport(findings=tuple(found)).exit_code == 1
     (worst,) = [finding for finding in found if finding.severity is Severity.FAIL]
     assert "a run trips at 30%" in worst.seen
-    assert ("check cable" in worst.do) is not local and ("--corrupt" in worst.do) is local
+    assert ("check cable" in worst.do) is not local and ("--corrupt" in worst.do) is spoilt
 
 
 def test_what_is_printed_fits_the_terminal(

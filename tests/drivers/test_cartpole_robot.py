@@ -11,11 +11,12 @@ from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.cartpole.robots.robot import CartpoleRobot
 from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.cartpole.wire.protocol import DELIMITER, Info
+from deal_hw.drivers.command_echo import NumberWatch
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
 from deal_hw.testing.fake_device import FakeDevice
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
-from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
+from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command, run_cycles
 from deal_hw.transport import Message, Transport
 from deal_hw.types import Status
 
@@ -157,6 +158,36 @@ def test_lost_and_repeated_frames_are_survived() -> None:
         robot.send_command(default_command(robot))
         robot.read_state(0.5)
     assert faults[0].dropped > 5 < faults[0].duplicated
+
+
+@pytest.mark.parametrize("number", [0, 7, 4_000_000])
+def test_another_programs_target_is_a_fault(number: int) -> None:
+    """Its number is none that this run has sent since the one before: known by the second state with it."""
+    wire = Wire()
+    robot = wire.armed()
+    run_cycles(robot, wire.clock, 20, default_command(robot))
+    target = protocol.Target(number, 100_000, 1000, 100, 5000, 500_000)
+    wire.device.receive(protocol.encode(target))
+    seen: list[int] = []
+    while not robot.fault:
+        seen.append(robot.read_state(0.02).command_sequence)
+    assert robot.fault.startswith(f"another program commands the cart-pole: it follows command {number}, ")
+    assert seen.count(number) == 2
+    robot.passive()
+    robot.arm(1.0)
+    assert robot.fault == ""
+
+
+def test_one_corrupt_number_is_no_other_program() -> None:
+    """A check of 16 bits passes one in some ten thousand corrupt frames."""
+    watch = NumberWatch()
+    watch.shown(9)
+    for number in range(20):
+        watch.sent(number)
+        watch.shown(number if number != 10 else 3_000_000)
+        assert watch.foreign == -1
+    watch.shown(3)
+    assert watch.foreign == 3
 
 
 def test_a_torn_write_does_not_swallow_the_next_frame() -> None:

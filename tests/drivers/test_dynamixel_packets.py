@@ -17,6 +17,7 @@ from deal_hw.drivers.cartpole.dynamixel.device import DynamixelDevice
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.servo_bus import registers
 from deal_hw.drivers.servo_bus.bus import Bus
+from deal_hw.drivers.servo_bus.interface import SpoiltAnswerError
 from deal_hw.drivers.servo_bus.packets import (
     Instruction,
     Packet,
@@ -37,6 +38,7 @@ from deal_hw.drivers.servo_bus.registers import (
     Register,
 )
 from deal_hw.drivers.servo_bus.samples import SampleGrid, TickClock
+from deal_hw.drivers.servo_bus.servos_side import at_once
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import DealHwError, FrameError, TransportTimeoutError
 from deal_hw.testing.fake_device import FakeDevice
@@ -179,6 +181,99 @@ def test_group_answers_are_read_as_they_were_sent(blocks: list[bytes]) -> None:
         bus = bus_that_hears(answer)
         bus.ask((1, 2), BLOCK_ADDRESS, BLOCK_BYTES, fast=is_fast)
         assert bus.take(10**12) == data
+
+
+class EchoingDevice:
+    """Servos behind an adapter that returns the host's bytes, with another master's packets between.
+
+    Args:
+        answer: What the servos answer to each message.
+        foreign: What another master sends before.
+    """
+
+    def __init__(self, answer: bytes, foreign: bytes = b"") -> None:
+        self.device_ns = 0
+        self._answer, self._foreign, self._out = answer, foreign, b""
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host."""
+        self._out += data + self._foreign + self._answer
+
+    def tick(self) -> bytes:
+        """Send what waits."""
+        self.device_ns += 1_000_000
+        out, self._out = self._out, b""
+        return out
+
+
+def bus_behind(device: EchoingDevice) -> Bus:
+    """Return a bus over a device."""
+    clock = VirtualClock()
+    transport = VirtualTransport(device, clock)
+    transport.open()
+    return Bus(transport, clock, 1_000_000, 0.003)
+
+
+BOTH = {servo: bytes([servo]) * BLOCK_BYTES for servo in (1, 2)}
+ANSWERS = {
+    True: fast_status([(servo, 0, block) for servo, block in BOTH.items()], 2 * (BLOCK_BYTES + 4)),
+    False: b"".join(status(servo, 0, block) for servo, block in BOTH.items()),
+}
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_an_echo_is_neither_an_answer_nor_another_master(fast: bool) -> None:
+    """Of requests to a group, and of goals."""
+    bus = bus_behind(EchoingDevice(ANSWERS[fast]))
+    for _ in range(3):
+        bus.ask((1, 2), BLOCK_ADDRESS, BLOCK_BYTES, fast=fast, writes=[(116, {1: BOTH[1][:4]})])
+        assert bus.take(10**12) == BOTH
+    assert bus.echoes and bus.watch.sign is None
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_another_masters_packets_are_told_from_answers(fast: bool) -> None:
+    """They cost no answer; two are a sign."""
+    foreign = instruction(0xFE, Instruction.SYNC_WRITE, bytes([116, 0, 4, 0, 1, 0, 8, 0, 0]))
+    bus = bus_behind(EchoingDevice(ANSWERS[fast], foreign))
+    for known in (False, True):
+        bus.ask((1, 2), BLOCK_ADDRESS, BLOCK_BYTES, fast=fast)
+        assert bus.take(10**12) == BOTH
+        assert (bus.watch.sign is not None) is known
+    assert bus.watch.sign is not None and bus.watch.sign.packet == "a packet (sync write) to all servos"
+
+
+@pytest.mark.parametrize("doubled", [1, 2])
+def test_a_group_names_the_servos_whose_answers_are_sound(doubled: int) -> None:
+    """The others', where two servos of one id answer at the same time."""
+    blocks = [(servo, 0, block) for servo, block in BOTH.items()]
+    twin = (doubled, 0, bytes([7]) * BLOCK_BYTES)
+    spoilt = b"".join(
+        at_once([status(*one), status(*twin)]) if one[0] == doubled else status(*one) for one in blocks
+    )
+    bus = bus_that_hears(spoilt)
+    bus.ask((1, 2), BLOCK_ADDRESS, BLOCK_BYTES)
+    with pytest.raises(SpoiltAnswerError) as caught:
+        bus.take(10**12)
+    assert caught.value.answered == (3 - doubled,)
+
+
+def test_a_spoilt_part_of_a_fast_answer_is_not_taken() -> None:
+    """The last servo's CRC is right: it is made of the bytes as they came."""
+    good, twin = ((1, 0, BOTH[1]), (1, 0, bytes([6]) * BLOCK_BYTES))
+    spoilt = fast_status([good, twin, (2, 0, BOTH[2])], 2 * (BLOCK_BYTES + 4))
+    answers = [ANSWERS[True], spoilt]
+    device = EchoingDevice(b"")
+    bus = bus_behind(device)
+    for answer in answers:
+        device._answer = answer
+        bus.ask((1, 2), BLOCK_ADDRESS, BLOCK_BYTES, fast=True)
+        if answer is not spoilt:
+            assert bus.take(10**12) == BOTH
+            continue
+        with pytest.raises(SpoiltAnswerError) as caught:
+            bus.take(10**12)
+        assert caught.value.answered == (2,)
 
 
 def test_signs_of_a_block() -> None:

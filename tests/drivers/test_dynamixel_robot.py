@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
+from dynamixel_rig import Wire, middle
 
-from deal_hw.clock import VirtualClock
 from deal_hw.control.safety.passive import make_passive
-from deal_hw.drivers.cartpole.dynamixel.device import OVERLOAD, DynamixelDevice
-from deal_hw.drivers.cartpole.dynamixel.robot import DynamixelCartpole
+from deal_hw.drivers.cartpole.dynamixel.device import OVERLOAD
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings
-from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.drivers.cartpole.wire.protocol import Target
 from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
 from deal_hw.drivers.servo_bus.registers import (
@@ -30,7 +26,6 @@ from deal_hw.drivers.servo_bus.registers import (
     Register,
 )
 from deal_hw.drivers.transports.listen_only import listen_only
-from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.errors import (
     ConfigurationError,
     SafetyError,
@@ -38,56 +33,9 @@ from deal_hw.errors import (
     WrongDeviceError,
 )
 from deal_hw.testing.faults import FaultRates, FaultyTransport, FrameFaults, OneBadFrame
-from deal_hw.testing.robot_suite import RobotBench, RobotSuite, arm, default_command, run_cycles
+from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, Transport
-from deal_hw.types import RobotState, Status
-
-
-class Wire:
-    """An emulated cart-pole on two servos, its driver, and everything between them."""
-
-    def __init__(
-        self,
-        wrap: Callable[[Transport], Transport] = lambda transport: transport,
-        profile: str = "ideal",
-        device: DynamixelSettings | None = None,
-        **settings: Any,
-    ) -> None:
-        self.clock = VirtualClock()
-        if "cart_zero" not in settings:
-            settings["cart_zero"] = middle()
-        made = DynamixelSettings(**settings)
-        self.device = DynamixelDevice(nominal_truth(profile), device or made)
-        self.virtual = VirtualTransport(self.device, self.clock)
-        self.robot = DynamixelCartpole(wrap(self.virtual), self.clock, made)
-
-    @property
-    def cart(self) -> EmulatedServo:
-        """The belt servo."""
-        return self.device.servos[0]
-
-    @property
-    def pole(self) -> EmulatedServo:
-        """The pole servo."""
-        return self.device.servos[1]
-
-    def armed(self) -> DynamixelCartpole:
-        """Return the driver, connected, homed and armed, after its first command."""
-        arm(self.robot)
-        return self.robot
-
-    def run(self, cycles: int, target: float = 0.0) -> list[RobotState]:
-        """Command and read as the control loop does; return the states."""
-        return run_cycles(self.robot, self.clock, cycles, default_command(self.robot, target))
-
-
-@functools.cache
-def middle() -> int:
-    """Return where the emulated belt servo reads the middle, as a user would write it down."""
-    wire = Wire(cart_zero=None)
-    wire.robot.connect()
-    wire.robot.home(20.0)
-    return wire.robot._zero % 4096
+from deal_hw.types import Status
 
 
 class TestDynamixelCartpole(RobotSuite):

@@ -367,6 +367,53 @@ def test_the_newer_of_two_answers_counts() -> None:
     assert bus.alerts[1] == 0
 
 
+WRITE_GOAL = encode(1, Instruction.WRITE, bytes([42, 0, 8]))
+SYNC_GOALS = encode(BROADCAST, Instruction.SYNC_WRITE, bytes([42, 2, 1, 0, 8, 2, 0, 8]))
+
+
+@pytest.mark.parametrize(
+    ("packet", "named"),
+    [(WRITE_GOAL, "a packet (write) to servo 1"), (SYNC_GOALS, "a packet (sync write) to all servos")],
+)
+@pytest.mark.parametrize("place", ["before", "behind"])
+def test_another_masters_packets_are_told_from_answers(packet: bytes, named: str, place: str) -> None:
+    """They cost no answer. Two are a sign, also those that come when nothing is asked."""
+    bus, _ = says(packet + group(BLOCKS) if place == "before" else group(BLOCKS) + packet)
+    assert take(bus) == BLOCKS
+    assert bus.watch.sign is None
+    assert take(bus) == BLOCKS
+    # What came behind the group is found before the next request.
+    assert take(bus) == BLOCKS
+    assert bus.watch.sign is not None and bus.watch.sign.packet == named
+    assert not bus.echoes
+
+
+def test_an_echo_is_no_other_master() -> None:
+    """Of requests to one servo, to a group, and of goals, however many."""
+    bus, _ = says(group(BLOCKS), echo=True)
+    for goal in range(5):
+        bus.post([(42, {1: bytes([goal, 8]), 2: bytes([goal, 8])})])
+        assert take(bus) == BLOCKS
+    assert bus.echoes and bus.watch.sign is None and bus.errors == 0
+
+
+def test_faults_of_a_servo_are_no_packet_of_another_master() -> None:
+    """Voltage and sensor together are the number of the instruction Write."""
+    faults = dict.fromkeys(BLOCKS, Fault.VOLTAGE | Fault.ENCODER)
+    bus, _ = says(group({servo: bytes([1]) * 15 for servo in BLOCKS}, faults))
+    for _ in range(4):
+        assert take(bus) is not None
+    assert bus.watch.sign is None
+
+
+def test_two_answers_of_one_servo_are_noted() -> None:
+    """With one answer each, nobody answers twice."""
+    answers = [group({1: BLOCKS[1]}) + group(BLOCKS), group(BLOCKS)]
+    bus, _ = bus_with(lambda request: answers.pop(0))
+    assert take(bus) == BLOCKS and bus.doubled == {1}
+    assert take(bus) == BLOCKS and not bus.doubled
+
+
 @given(st.binary(max_size=200))
 @settings(max_examples=300)
 def test_hostile_answers_do_not_upset_the_bus(data: bytes) -> None:

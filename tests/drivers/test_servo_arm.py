@@ -469,6 +469,17 @@ def test_an_arm_that_cannot_be_lowered_goes_off_all_the_same(tmp_path: Path, bus
 # Before any motion.
 
 
+def test_an_adapter_that_returns_our_packets_is_said_and_costs_nothing(tmp_path: Path) -> None:
+    """Such as one that joins both directions of a half-duplex line; it is no other program."""
+    rig = Rig(tmp_path, "feetech")
+    rig.device.bus.echo = True
+    robot = rig.armed()
+    assert robot.info is not None and "returns this computer's own packets" in robot.info.servos
+    errors = robot.transport_errors
+    assert len(rig.run(20)) >= 19
+    assert not robot.fault and robot.transport_errors == errors
+
+
 def test_a_missing_servo_is_named_with_those_that_answer(rig: Rig) -> None:
     """And what to check."""
     rig.servos[1].present = False

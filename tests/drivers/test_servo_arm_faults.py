@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopRepor
 from deal_hw.control.process.channel import Outcome
 from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.control.safety.safety import Safety
-from deal_hw.drivers.servo_arm.absence import SILENT_NS, AbsenceWatch
+from deal_hw.drivers.servo_arm.absence import QUIET_NS, SILENT_NS, AbsenceWatch, CollisionWatch
 from deal_hw.drivers.servo_arm.families import DAMPING, FAMILIES, OFF, ON
 from deal_hw.drivers.servo_arm.faults import ArmFaults
 from deal_hw.drivers.servo_arm.robot import ServoArm
@@ -169,6 +170,116 @@ def test_a_torque_that_another_program_took_is_said(tmp_path: Path, bus: str) ->
     rig.device.receive(_torque_off(rig))
     rig.run(3)
     assert "servo 2 (elbow) lost its torque" in robot.fault and "another program" in robot.fault
+
+
+# Another master, and two servos of one id.
+
+FOREIGN = r"another program commands this bus: servo 2 \(elbow\) has the goal 2200 ticks, which this run did "
+ON_LINE = r"another program commands this bus: on the bus came a packet \(sync write\) to all servos"
+TWOFOLD = {
+    servo: f"two servos answer as id {servo} ({NAMES[servo][9:-1]}), or its plug is loose" for servo in (1, 2)
+}
+
+
+def commands_until_the_trip(rig: Rig) -> int:
+    """Run until the driver has a fault; return how many commands were sent after another program began."""
+    robot = rig.armed()
+    while not rig.device.trouble:
+        rig.run(1)
+    count = 0
+    while not robot.fault:
+        rig.run(1)
+        count += 1
+        assert count < 20, "no fault"
+    return count
+
+
+@pytest.mark.parametrize(("rate_hz", "most"), [(100.0, 3), (60.0, 3), (30.0, 5)])
+def test_another_programs_goals_trip_at_once(tmp_path: Path, bus: str, rate_hz: float, most: int) -> None:
+    """By the second state that shows one: within two or three cycles where it writes in each of them."""
+    rig = Rig(tmp_path, bus, faults=ArmFaults(foreign_writer_after_s=0.3, foreign_rate_hz=rate_hz))
+    assert commands_until_the_trip(rig) <= most
+    assert re.match(FOREIGN, rig.robot.fault) and "end it" in rig.robot.fault
+    assert "torque and goals again" in rig.robot.fault
+
+
+def test_a_run_with_another_program_ends_passive(tmp_path: Path, bus: str) -> None:
+    """The reason is that, and no number of transport errors; that all motors are passive is confirmed."""
+    rig = Rig(tmp_path, bus, faults=ArmFaults(foreign_writer_after_s=0.3))
+    report = played(rig)
+    assert (report.outcome, report.passive_confirmed) == (Outcome.TRIPPED, True)
+    assert re.match(FOREIGN, report.reason) and report.flags == ("device_fault",)
+    assert torques(rig) == [PASSIVE[bus]] * 2
+
+
+def test_another_masters_packets_on_the_line_are_named(tmp_path: Path, bus: str) -> None:
+    """Even where it writes what this run writes: two masters on one line collide."""
+    rig = Rig(tmp_path, bus)
+    robot = rig.armed()
+    rig.run(3)
+    for _ in range(2):
+        assert not robot.fault
+        rig.device.bus.receive_foreign(rig.device.joints[1].goal_packet(rig.device.joints[1].goal), True)
+        rig.run(1)
+    assert re.match(ON_LINE, robot.fault)
+
+
+def test_another_program_is_named_on_the_way_to_the_start_pose(tmp_path: Path, bus: str) -> None:
+    """And not as a joint that is blocked; the motors become passive."""
+    rig = Rig(tmp_path, bus, faults=ArmFaults(foreign_writer_after_s=0.2, foreign_rate_hz=100.0))
+    robot = rig.armed()
+    rig.run(3, target=0.8)
+    with pytest.raises(SafetyError, match=FOREIGN.replace("2200", r"\d+")):
+        robot.home(20.0)
+    rig.advance(0.05)
+    assert ON not in torques(rig)
+
+
+def test_after_the_other_program_has_ended_the_arm_starts_again(tmp_path: Path, bus: str) -> None:
+    """Its goals are those before the start."""
+    rig = Rig(tmp_path, bus, faults=ArmFaults(foreign_writer_after_s=0.3))
+    played(rig)
+    rig.device._other = None
+    rig.robot.connect()
+    rig.robot.home(5.0)
+    rig.robot.arm(1.0)
+    assert len(rig.run(10)) >= 9 and not rig.robot.fault
+
+
+def test_one_corrupt_goal_is_no_other_program(tmp_path: Path, bus: str) -> None:
+    """Of a corrupt answer that passed its checksum, or of such a command."""
+    rig = Rig(tmp_path, bus)
+    robot = rig.armed()
+    rig.run(3)
+    rig.device.bus.receive_foreign(rig.device.joints[1].goal_packet(2345), False)
+    errors = robot.transport_errors
+    rig.run(30)
+    assert not robot.fault and robot.transport_errors <= errors + 1
+
+
+def test_a_second_servo_of_one_id_is_named(tmp_path: Path, bus: str, servo: int) -> None:
+    """Before the age of the states ends the run. Nobody confirms that both servos are passive."""
+    rig = Rig(tmp_path, bus, faults=ArmFaults(faulty_servo=servo, duplicate_id_after_s=0.3))
+    report = played(rig)
+    assert (report.outcome, report.passive_confirmed) == (Outcome.TRIPPED, False)
+    assert report.reason.startswith(TWOFOLD[servo]) and "an id of its own" in report.reason
+    assert report.flags == ("device_fault",)
+    assert torques(rig) == [PASSIVE[bus]] * 2
+
+
+@given(st.integers(2, 14), st.data())
+def test_noise_is_no_second_servo(count: int, data: st.DataObject) -> None:
+    """It spoils now this answer, now that one; a servo that alone is spoilt is named with the third."""
+    ids = tuple(range(1, count + 1))
+    watch = CollisionWatch(ids, 0)
+    now_ns, noisy = 0, data.draw(st.sampled_from(ids))
+    for spoilt in (noisy % count + 1, *([noisy] * 20)):
+        now_ns += PERIOD_NS
+        assert watch.missed([one for one in ids if one != spoilt], now_ns) is None
+    now_ns += QUIET_NS
+    watch.answered(now_ns)
+    named = [watch.missed([one for one in ids if one != noisy], now_ns + k * PERIOD_NS) for k in (1, 2, 3, 4)]
+    assert named == [None, None, noisy, noisy]
 
 
 def _torque_off(rig: Rig) -> bytes:

@@ -7,11 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from deal_hw.control.loop.timing import LoopTimingReport, Spread
 from deal_hw.control.process.channel import Outcome
 from deal_hw.control.process.supervisor import ChildEnd
-from deal_hw.robots.connect import on_this_computer
+from deal_hw.robots.connect import on_this_computer, spoilt_on_purpose
 from deal_hw.workflows import causes
 from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
+from deal_hw.workflows.emulation.common import announced_faults
+from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.running.episode import account
 
 pytestmark = pytest.mark.real_time
@@ -34,7 +37,82 @@ def test_each_cause_fits_the_wire() -> None:
     )
     assert late_advice(False, BUSY).startswith("load 12.3 on 2 processors: this computer is busy")
     assert "check cable" in late_advice(False, IDLE) and "busy" not in late_advice(False, IDLE)
-    assert "--corrupt" in corrupt_advice(True, BUSY) and "check cable" in corrupt_advice(False, BUSY)
+    assert "no cable is at fault" in corrupt_advice(True, BUSY) and str(BUSY) in corrupt_advice(True, BUSY)
+    assert "another program uses its port" in corrupt_advice(True, BUSY)
+    assert "check cable" in corrupt_advice(False, BUSY)
+
+
+def test_only_an_emulator_that_says_so_spoils_frames() -> None:
+    """Else another program, or a busy computer, would be taken for it."""
+    for local in (True, False):
+        assert "on purpose" not in corrupt_advice(local, BUSY)
+        assert "--corrupt" in corrupt_advice(local, BUSY, spoilt=True)
+
+
+@pytest.mark.parametrize(
+    ("rates", "loses", "spoils"),
+    [
+        ({}, False, False),
+        ({"corrupt": 0.1}, False, True),
+        ({"drop": 0.1}, False, True),
+        ({"duplicate": 0.1}, False, True),
+        ({}, True, True),
+    ],
+)
+def test_an_emulator_says_whether_it_spoils_frames(
+    rates: dict[str, float], loses: bool, spoils: bool, tmp_path: Path
+) -> None:
+    """While it runs, by any spelling of its port; two emulators at one place both may."""
+    link = tmp_path / "robot"
+    link.symlink_to("/dev/pts/7777")
+    config = EmulateSettings("cartpole", **rates)  # type: ignore[arg-type]
+    for _ in range(2):
+        with (
+            announced_faults(config, "serial", "/dev/pts/7777", loses=loses),
+            announced_faults(config, "serial", "/dev/pts/7777", loses=loses),
+        ):
+            assert spoilt_on_purpose("serial", str(link)).held is spoils
+            assert not spoilt_on_purpose("serial", "/dev/pts/7778").held
+        assert not spoilt_on_purpose("serial", str(link)).held
+
+
+@pytest.mark.parametrize("spoilt", [False, True])
+def test_a_run_with_lost_states_says_whether_the_emulator_lost_them(spoilt: bool) -> None:
+    """In its warning on transport errors."""
+    none = Spread(0.0, 0.0, 0.0)
+    timing = LoopTimingReport(
+        rate_hz=50.0,
+        cycles=50,
+        period=none,
+        lateness=none,
+        overruns=0,
+        overruns_beyond_period=0,
+        skipped_periods=0,
+        state_age=none,
+        states=100,
+        transport_errors=30,
+    )
+    result = {
+        "outcome": "finished",
+        "reason": "",
+        "passive_confirmed": True,
+        "loop_timing": timing.to_json(),
+        "clipped": {},
+        "cycles_sent": 7,
+        "error": "",
+        "flags": [],
+    }
+    end = ChildEnd(
+        result=result,
+        exit_code=0,
+        killed="",
+        stop_cause="",
+        passive_confirmed=True,
+        recorder=None,
+        signal="",
+    )
+    (warning,) = account(end, None, "", True, spoilt).warnings
+    assert "30 transport errors" in warning and ("on purpose" in warning) is spoilt
 
 
 @pytest.mark.parametrize(

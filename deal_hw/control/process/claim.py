@@ -33,6 +33,18 @@ class LocalClaim:
         self._name = b"\0deal-hw/claim/" + hashlib.sha256(resource.encode()).hexdigest()[:32].encode()
         self._socket: socket.socket | None = None
 
+    @property
+    def held(self) -> bool:
+        """Whether a process on this computer holds the name, this one or another."""
+        try:
+            with socket.socket(socket.AF_UNIX) as asking:
+                asking.setblocking(False)
+                asking.connect(self._name)
+        except OSError as error:
+            # A full queue of a holder.
+            return error.errno == errno.EAGAIN
+        return True
+
     def fileno(self) -> int:
         """Return the descriptor that a child inherits."""
         if self._socket is None:

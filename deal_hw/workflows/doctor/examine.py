@@ -23,6 +23,7 @@ from deal_hw.robots.connect import (
     on_this_computer,
     other_wires,
     reached_over,
+    spoilt_on_purpose,
 )
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
@@ -212,7 +213,8 @@ def _examine_link(config: DoctorRobotSettings, name: str, clock: Clock) -> Itera
         yield from entry.load(wire.examine)(config.port, clock)
     robot = make_robot(config.robot, name, config.port, clock)
     local = on_this_computer(name, config.port)
-    yield from examine_robot(config.robot, robot, clock, config.seconds, local)
+    spoilt = spoilt_on_purpose(name, config.port, network).held
+    yield from examine_robot(config.robot, robot, clock, config.seconds, local, spoilt)
 
 
 def list_plug_ins() -> Iterator[Finding]:
@@ -255,7 +257,7 @@ _PATIENCE_S = 1.0
 
 
 def examine_robot(
-    name: str, robot: Robot, clock: Clock, seconds: float, local: bool = False
+    name: str, robot: Robot, clock: Clock, seconds: float, local: bool = False, spoilt: bool = False
 ) -> Iterator[Finding]:
     """Yield findings on a robot without motor commands; connecting may switch the motors off.
 
@@ -265,6 +267,7 @@ def examine_robot(
         clock: The clock of its stamps.
         seconds: How long to listen [s].
         local: It is a program on this computer, such as an emulator.
+        spoilt: It says that it spoils frames on purpose.
 
     Raises:
         DealHwError: It cannot be reached, or it is another device.
@@ -297,11 +300,11 @@ def examine_robot(
     text = f"{errors} of {errors + len(host_ns)} states corrupt or lost ({share:.1%})"
     # The measure of the safety module: errors among the states that were due.
     due = max((host_ns[-1] - host_ns[0]) * 1e-9, _PATIENCE_S) * wanted_hz
+    advice = corrupt_advice(local, Load.now(), spoilt)
     if errors > _TRIPS * due:
-        advice = corrupt_advice(local, Load.now())
         yield Finding("states", Severity.FAIL, f"{text}; a run trips at {_TRIPS:.0%}", advice)
     else:
-        yield Finding.judged("states", share > _FEW_ERRORS, text, corrupt_advice(local, Load.now()))
+        yield Finding.judged("states", share > _FEW_ERRORS, text, advice)
     yield judge_clock(np.array(host_ns), np.array(device_ns))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
+from deal_hw.drivers.cartpole.plant.profiles import profile
 from deal_hw.errors import MissingExtraError
 from deal_hw.robots import robot_entry
 from deal_hw.workflows.emulation.common import choose_truth, serve
@@ -58,7 +59,8 @@ def emulate_cartpole(
     def report() -> dict[str, Any]:
         return {**truth.to_json(), **emulator.report()}
 
-    serve(emulator, config, what, stop, cut, announce=announce, report=report)
+    loses = profile(truth.profile).drop_probability > 0
+    serve(emulator, config, what, stop, cut, announce=announce, report=report, loses=loses)
     say(
         f"emulator: this computer stalled it {emulator.slips} times; {emulator.dropped} frames came while no "
         "program read the port"

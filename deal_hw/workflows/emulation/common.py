@@ -16,8 +16,11 @@ from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.realtime import priority
 from deal_hw.errors import ConfigurationError
 from deal_hw.reading import read_json, reading
+from deal_hw.robots import robot_entry
+from deal_hw.robots.connect import spoilt_on_purpose
 from deal_hw.robots.emulation import Emulation
 from deal_hw.signals import ENDING, taken
+from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.options import File
 from deal_hw.workflows.say import Say, silent
@@ -69,6 +72,24 @@ def happenings(path: File | None, *logs: Sequence[tuple[int, int, str]]) -> Iter
         yield tell
 
 
+def announced_faults(
+    config: EmulateSettings, wire: str, port: str, options: WireOptions | None = None, *, loses: bool = False
+) -> AbstractContextManager[object]:
+    """Say to runs on this computer that the emulator spoils frames on purpose, if it does.
+
+    Args:
+        config: Its settings.
+        wire: Its wire.
+        port: Its port.
+        options: More about a transport of topics.
+        loses: Whether its profile loses frames.
+    """
+    name = spoilt_on_purpose(wire, port, options)
+    if not (config.corrupt or config.drop or config.duplicate or loses) or name.held:
+        return contextlib.nullcontext()
+    return name
+
+
 def realtime_priority() -> AbstractContextManager[None]:
     """Use real-time priority where permitted, since a real robot does not share the host's processor."""
     return priority(_FIFO_PRIORITY, children=True)
@@ -98,6 +119,7 @@ def serve(
     *,
     announce: Say,
     report: Callable[[], Mapping[str, Any]],
+    loses: bool = False,
 ) -> None:
     """Run an emulator until a stop, the given time or the end of its port, and reveal its truth.
 
@@ -109,13 +131,19 @@ def serve(
         cut: Cuts the wire.
         announce: Called with the port first, and with the truth at the end.
         report: Returns the truth and what happened.
+        loses: Whether its profile loses frames.
     """
+    wire = config.transport or robot_entry(config.robot).emulated_on[0]
     try:
         port = emulation.open()
         announce(f"port {port}")
         announce(f"{what}; Ctrl-C ends")
         announce(next_line(config, port))
-        with realtime_priority(), happenings(config.events_to, emulation.changes) as tell:
+        with (
+            announced_faults(config, wire, port, loses=loses),
+            realtime_priority(),
+            happenings(config.events_to, emulation.changes) as tell,
+        ):
 
             def step() -> bool:
                 if cut.is_set():

@@ -16,7 +16,14 @@ from deal_hw.drivers.unitree.emulator import DeviceOnTopics
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.robots import robot_entry
 from deal_hw.robots.connect import make_topic_transport
-from deal_hw.workflows.emulation.common import happenings, next_line, realtime_priority, reveal, run_until
+from deal_hw.workflows.emulation.common import (
+    announced_faults,
+    happenings,
+    next_line,
+    realtime_priority,
+    reveal,
+    run_until,
+)
 from deal_hw.workflows.emulation.settings import EmulateOnTopicsSettings, EmulateSettings
 from deal_hw.workflows.say import Say, silent
 
@@ -74,6 +81,7 @@ def emulate_on_topics(
 
             log = device.log
             with (
+                announced_faults(config, transport, port, config.wire.on(transport)),
                 happenings(config.events_to, log.requests, log.changes) as tell,
                 (watch or _unwatched)(device) as seen,
             ):

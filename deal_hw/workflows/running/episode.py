@@ -30,7 +30,7 @@ from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.errors import DealHwError
 from deal_hw.robot import Robot
 from deal_hw.robots import balanced, robot_entry, walked
-from deal_hw.robots.connect import on_this_computer
+from deal_hw.robots.connect import on_this_computer, spoilt_on_purpose
 from deal_hw.signals import OPERATOR, name
 from deal_hw.version import __version__
 from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
@@ -133,6 +133,7 @@ class EpisodeRun:
                 self._path,
                 self._robot.if_cut,
                 on_this_computer(self._plan.transport, self._plan.port),
+                spoilt_on_purpose(self._plan.transport, self._plan.port, self._plan.wire).held,
             ),
             planned_s=self._plan.total_s,
         )
@@ -220,7 +221,9 @@ _LINK_WARNING = 0.01
 """Share of corrupt and missing state frames above which the operator gets a warning."""
 
 
-def account(end: ChildEnd, path: Path | None, if_cut: str, local: bool = False) -> EpisodeReport:
+def account(
+    end: ChildEnd, path: Path | None, if_cut: str, local: bool = False, spoilt: bool = False
+) -> EpisodeReport:
     """Return the report on an episode from the ends of its processes.
 
     Args:
@@ -228,6 +231,7 @@ def account(end: ChildEnd, path: Path | None, if_cut: str, local: bool = False) 
         path: The recording.
         if_cut: What the robot does without a connection, as a sentence.
         local: The robot is a program on this computer.
+        spoilt: It says that it spoils frames on purpose.
     """
     result = end.result or {}
     outcome, reason, error = _verdict(end, result)
@@ -239,7 +243,7 @@ def account(end: ChildEnd, path: Path | None, if_cut: str, local: bool = False) 
         share = loop_timing.transport_errors / (loop_timing.states + loop_timing.transport_errors)
         warnings.append(
             f"{loop_timing.transport_errors} transport errors, {share:.0%} of the state frames: "
-            f"{corrupt_advice(local, Load.now())}"
+            f"{corrupt_advice(local, Load.now(), spoilt)}"
         )
     flags = tuple(result.get("flags", ()))
     if outcome is Outcome.TRIPPED and LATE.intersection(flags):

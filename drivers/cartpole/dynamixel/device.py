@@ -17,6 +17,8 @@ from deal_hw.drivers.cartpole.plant.sensor import Motor
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
 from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
+from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN, WAY_TICKS, OtherMaster
+from deal_hw.drivers.servo_bus.packets import sync_write
 from deal_hw.drivers.servo_bus.registers import (
     GOAL_POSITION,
     HARDWARE_ERROR,
@@ -77,6 +79,7 @@ class DynamixelDevice(EmulatedDevice):
         self._now_ns = 0
         self._lit = self._let_go = False
         self._first_ns: int | None = None
+        self._other: OtherMaster | None = None
         motor = mechanics.motor()
         mechanics.observe(motor.position)
         self._sense(motor)
@@ -117,6 +120,10 @@ class DynamixelDevice(EmulatedDevice):
     @property
     def trouble(self) -> str:
         """Current fault of the servos; "" for none."""
+        if self._other is not None:
+            return FOREIGN
+        if len(self.servos) > 2:
+            return DOUBLED
         if not self._pole.present:
             return "pole servo absent"
         if not self._cart.awake(self._now_ns):
@@ -188,6 +195,8 @@ class DynamixelDevice(EmulatedDevice):
         mechanics.step(force)
         self._tick += 1
         self._fail()
+        if self._other is not None:
+            self._other.advance(self._now_ns)
 
     def _follow_hand(self) -> None:
         lit = bool(self._pole.block.led) and self._pole.awake(self._now_ns)
@@ -220,3 +229,11 @@ class DynamixelDevice(EmulatedDevice):
             self._cart.fail(OVERLOAD)
         if f.servo_absent_after_s is not None and passed_s > f.servo_absent_after_s:
             self._pole.present = False
+        if f.duplicate_id_after_s is not None and passed_s > f.duplicate_id_after_s:
+            self._faults = f = dataclasses.replace(f, duplicate_id_after_s=None)
+            self.servos.append(self._cart.twin())
+        if f.foreign_writer_after_s is not None and passed_s > f.foreign_writer_after_s:
+            goal = self._cart.get(GOAL_POSITION) + WAY_TICKS
+            packet = sync_write(GOAL_POSITION, {self._cart.id: goal})
+            self._faults = dataclasses.replace(f, foreign_writer_after_s=None)
+            self._other = OtherMaster(packet, self.bus, f, self._now_ns)

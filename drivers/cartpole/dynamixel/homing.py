@@ -158,6 +158,8 @@ class Homing:
         if self._clock.now_ns() >= self._deadline_ns:
             raise TransportTimeoutError(f"cartpole: homing did not finish in time: {missing}")
         blocks = self._servos.read(self._deadline_ns)
+        if foreign := self._servos.foreign:
+            raise SafetyError(f"cartpole: {foreign}")
         for servo, block in zip((self._settings.cart_id, self._settings.pole_id), blocks, strict=True):
             if block.hardware_error:
                 raise SafetyError(

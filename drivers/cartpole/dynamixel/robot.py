@@ -13,10 +13,10 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.dynamixel.examine import DynamixelInfo, Examination
 from deal_hw.drivers.cartpole.dynamixel.homing import Homing
-from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos
+from deal_hw.drivers.cartpole.dynamixel.servos import WATCHDOG_S, PoleAngle, Servos, part_of
 from deal_hw.drivers.cartpole.dynamixel.settings import DynamixelSettings, Goal
 from deal_hw.drivers.servo_bus.bus import Bus
-from deal_hw.drivers.servo_bus.polled_robot import MISSES, PolledRobot, status_of
+from deal_hw.drivers.servo_bus.polled_robot import MISSES, PolledRobot, status_of, two_servos
 from deal_hw.drivers.servo_bus.registers import (
     PROFILE_ONGOING,
     RAD_S_PER_COUNT,
@@ -97,6 +97,7 @@ class DynamixelCartpole(PolledRobot[Bus]):
         self._stamping = False
         self._pair_misses = 0
         self._misses = dict.fromkeys(self._servos, 0)
+        self._spoilt = dict.fromkeys(self._servos, 0)
         self._zero = 0
         self._pole = PoleAngle(self.settings)
         self._stopped = False
@@ -205,34 +206,41 @@ class DynamixelCartpole(PolledRobot[Bus]):
             return
         try:
             blocks = self.servos.take(deadline_ns)
-        except (TransportTimeoutError, FrameError):
-            self._miss()
+        except (TransportTimeoutError, FrameError) as error:
+            self._latch(self.servos.foreign)
+            self._miss(isinstance(error, FrameError))
             return
         if blocks is None:
             return
         asked, self._asked = self._asked, ()
         self._poller.answered()
         for servo in asked:
-            self._misses[servo] = 0
+            self._misses[servo] = self._spoilt[servo] = 0
         if len(asked) == 2 or not any(self._misses.values()):
             self._pair_misses = 0
         if len(asked) == 2 or (self._stopped and asked == self._servos[:1]):
             self._receive(blocks)
 
-    def _miss(self) -> None:
+    def _miss(self, spoilt: bool) -> None:
+        """Count an answer that is missing, or spoilt; name the servo of which this is known."""
         asked, self._asked = self._asked, ()
         if len(asked) == 2:
             self._pair_misses += 1
             if self._pair_misses == MISSES:
                 # Until each has answered alone, neither is known to be present.
                 self._misses = dict.fromkeys(self._servos, 1)
+                self._spoilt = dict.fromkeys(self._servos, 0)
                 self._turns = dict.fromkeys(self._servos, 0)
             return
-        self._misses[asked[0]] += 1
-        if self._misses[asked[0]] > MISSES:
-            role = "belt" if asked == self._servos[:1] else "pole"
+        servo = asked[0]
+        self._misses[servo] += 1
+        self._spoilt[servo] += spoilt
+        if self._misses[servo] > MISSES:
+            part = part_of(servo, self.settings)
             self._latch(
-                f"servo {asked[0]} ({role}) stopped answering: it restarted, or lost its supply or its "
+                two_servos(servo, part)
+                if self._spoilt[servo] >= MISSES
+                else f"servo {servo} ({part}) stopped answering: it restarted, or lost its supply or its "
                 "cable. Check both, then start again"
             )
 
@@ -241,6 +249,7 @@ class DynamixelCartpole(PolledRobot[Bus]):
             servo: self._ticks[servo].read(b.tick_ms, self._poller.asked_ns) for servo, b in blocks.items()
         }
         self._judge(blocks)
+        self._latch(self.servos.foreign)
         cart, time_ms = blocks[self._servos[0]], times[self._servos[0]]
         shift_ms = self._grid.place(time_ms)
         if shift_ms is None:

@@ -51,6 +51,14 @@ class Servos:
         self._effort = GOAL_CURRENT if settings.mode == "current" else GOAL_PWM
 
     @property
+    def foreign(self) -> str:
+        """That another program commands the servos, and what to do; "" if none does."""
+        sign = self._bus.watch.sign
+        if sign is None:
+            return ""
+        return sign.text("" if sign.servo is None else part_of(sign.servo, self._settings))
+
+    @property
     def stamp_ns(self) -> int:
         """Arrival time of the newest bytes [ns]."""
         return self._bus.stamp_ns
@@ -149,6 +157,11 @@ class Servos:
     def light(self, on: bool) -> None:
         """Switch the pole servo's LED; never waits."""
         self._bus.post([(LED.address, {self._settings.pole_id: bytes([on])})])
+
+
+def part_of(servo: int, settings: DynamixelSettings) -> str:
+    """Return the part of the cart-pole that a servo has, by its id."""
+    return "belt" if servo == settings.cart_id else "pole"
 
 
 class PoleAngle:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
+from deal_hw.drivers.servo_bus.faults import BusFaults
 from deal_hw.ranges import Checked, Range
 from deal_hw.testing.joint_faults import JointFaults
 from deal_hw.testing.pseudo_terminal import PortFaults
@@ -46,8 +47,11 @@ class CanFaults(Checked):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ServoFaults(Checked):
-    """Emulated Dynamixel servos and their faults, whose times count from the first arming of the motor."""
+class ServoFaults(BusFaults):
+    """Emulated Dynamixel servos and their faults, whose times count from the first arming of the motor.
+
+    The faulty servo is that of the belt.
+    """
 
     servo_baud_rate: Literal[57600, 115200, 1000000, 2000000, 3000000, 4000000] = 1000000
     """Dynamixel: baud rate of both servos; a port with another rate does not reach them."""

@@ -15,6 +15,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION
 from deal_hw.drivers.cartpole.wire import protocol
 from deal_hw.drivers.cartpole.wire.link import HostLink, SerialLink
+from deal_hw.drivers.command_echo import NumberWatch
 from deal_hw.errors import (
     SafetyError,
     TransportTimeoutError,
@@ -71,6 +72,7 @@ class CartpoleRobot(Robot):
         self._gaps = 0
         self._next_state: int | None = None
         self._sequence = -1
+        self._numbers = NumberWatch()
         self._after_ack: Status | None = None
         self._torn = self._connected = False
 
@@ -106,6 +108,7 @@ class CartpoleRobot(Robot):
 
     def arm(self, timeout_s: float) -> None:
         """Let the motor follow commands; from now on the device's watchdog expects one every 200 ms."""
+        self._numbers.restart()
         self._ask(
             protocol.Arm(self._next_request()), timeout_s, reached=Status.ARMED, without=Status.WATCHDOG
         )
@@ -133,6 +136,7 @@ class CartpoleRobot(Robot):
         target = self._link.feasible(to_target(command, sequence))
         self._send(self._link.encode(target))
         self._sequence = sequence
+        self._numbers.sent(sequence)
         return from_target(target)
 
     def passive(self) -> None:
@@ -156,8 +160,14 @@ class CartpoleRobot(Robot):
 
     @property
     def fault(self) -> str:
-        """A received fault after which the host must not continue; "" for none."""
-        return self._link.fault
+        """A received fault after which the host must not continue; "" for none. Latched until armed again."""
+        if self._link.fault or self._numbers.foreign < 0:
+            return self._link.fault
+        return (
+            f"another program commands the cart-pole: it follows command {self._numbers.foreign}, which this "
+            f"run did not send (its last is {self._sequence}). It may arm the motor again: end it, then "
+            "start again"
+        )
 
     def fileno(self) -> int:
         """Return the descriptor of the transport."""
@@ -267,6 +277,7 @@ class CartpoleRobot(Robot):
                 self._gaps += missing if missing < _I32 else 1
             self._next_state = (message.sequence + 1) & _U32
             state = to_robot_state(message, stamp_ns)
+            self._numbers.shown(state.command_sequence)
             self._states.append(state)
             if self._ack is not None:
                 self._after_ack = state.status

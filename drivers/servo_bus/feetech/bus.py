@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Final
 
 from deal_hw.clock import Clock
@@ -22,18 +23,30 @@ from deal_hw.drivers.servo_bus.feetech.packets import (
     MAX_FRAME_BYTES,
     AnswerFrame,
     AnswerParser,
+    RequestFrame,
+    RequestParser,
     StsInstruction,
     encode,
 )
-from deal_hw.drivers.servo_bus.feetech.registers import FIRMWARE_MAJOR, ID, MODEL_NUMBER
+from deal_hw.drivers.servo_bus.feetech.registers import (
+    FIRMWARE_MAJOR,
+    FIRST_RAM,
+    GOAL_POSITION,
+    ID,
+    LOCK,
+    MODEL_NUMBER,
+    decode,
+)
 from deal_hw.drivers.servo_bus.interface import (
     Answer,
     Port,
     ServoBus,
     SilentServosError,
+    SpoiltAnswerError,
     WantedAnswer,
     Writes,
 )
+from deal_hw.drivers.servo_bus.master_watch import MasterWatch
 from deal_hw.drivers.servo_bus.registers import Register
 from deal_hw.errors import DealHwError, FrameError, ProtocolError, TransportTimeoutError
 from deal_hw.transport import Transport
@@ -43,6 +56,7 @@ _IDENTITY = Register(
     MODEL_NUMBER.address + MODEL_NUMBER.size - FIRMWARE_MAJOR.address,
     "Firmware Version to Model Number",
 )
+_INSTRUCTIONS: Final = frozenset(StsInstruction)
 _SEARCH_TRIES: Final = 3
 """Requests for the model of a servo that answered a broadcast ping."""
 
@@ -63,11 +77,14 @@ class FeetechBus(ServoBus):
     """
 
     def __init__(self, transport: Transport, clock: Clock, baud_rate: int, answer_s: float) -> None:
-        super().__init__(Port(transport, clock, baud_rate, answer_s), clock)
+        watch = MasterWatch(GOAL_POSITION, partial(decode, GOAL_POSITION))
+        super().__init__(Port(transport, clock, baud_rate, answer_s), clock, watch)
         self.alerts: dict[int, int] = {}
         self._parser = AnswerParser(FRAME_BYTES)
+        self._line = RequestParser()
         self._frames: deque[AnswerFrame] = deque()
         self._found: dict[int, bytes] = {}
+        self._twice: set[int] = set()
         self._skipped = 0
 
     def ping(self, servo: int) -> Answer:
@@ -197,6 +214,17 @@ class FeetechBus(ServoBus):
         self._port.buffer.clear()
         yield from self._parser.feed(data)
 
+    # Other masters.
+
+    def _find_requests(self, data: bytes) -> None:
+        for request in self._line.feed(data):
+            if request.instruction not in _INSTRUCTIONS:
+                continue
+            if self._port.sent(encode(*request)):
+                self.echoes = True
+            elif _asks(request):
+                self._note_request(StsInstruction(request.instruction).name, request.servo)
+
     # Groups.
 
     def _forget(self) -> None:
@@ -206,7 +234,7 @@ class FeetechBus(ServoBus):
         self._begin_group()
 
     def _begin_group(self) -> None:
-        self._found = {}
+        self._found, self._twice = {}, set()
         self._skipped = self._parser.skipped
 
     def _put_writes(self, writes: Writes) -> None:
@@ -246,10 +274,14 @@ class FeetechBus(ServoBus):
             if not fits:
                 continue
             self.alerts[frame.servo] = frame.error
-            # A second answer of a servo is newer: the first was an answer to an earlier request.
+            # A second answer of a servo is newer: the first was an answer to an earlier request. If this
+            # happens again and again, two servos have the id.
+            if frame.servo in self._found:
+                self._twice.add(frame.servo)
             self._found[frame.servo] = frame.data
             if len(self._found) == len(wanted.ids):
                 found = {servo: self._found[servo] for servo in wanted.ids}
+                self.doubled = frozenset(self._twice)
                 self._begin_group()
                 return found
             if frame.servo == wanted.ids[-1]:
@@ -268,8 +300,22 @@ class FeetechBus(ServoBus):
         missing = tuple(servo for servo in wanted.ids if servo not in self._found)
         others = tuple(servo for servo in wanted.ids if servo in self._found)
         corrupt = self._parser.skipped > self._skipped
+        self.doubled = frozenset(self._twice)
         self._begin_group()
         if corrupt:
             beside = f"; servos {others} did" if others else ""
-            return FrameError(f"servos {missing} did not answer soundly, there were corrupt bytes{beside}")
+            text = f"servos {missing} did not answer soundly, there were corrupt bytes{beside}"
+            return SpoiltAnswerError(text, others)
         return SilentServosError(missing, others)
+
+
+def _asks(frame: RequestFrame) -> bool:
+    """Return whether a frame with the number of an instruction is a request; it may be a servo's faults.
+
+    No servo has the broadcast id. Of other frames only a write to the registers of torque and goals is
+    certain: an answer to a request of ours begins with another number there.
+    """
+    if frame.servo == BROADCAST:
+        return True
+    writes = frame.instruction == StsInstruction.WRITE and len(frame.params) > 1
+    return writes and FIRST_RAM <= frame.params[0] < LOCK.address

@@ -79,6 +79,14 @@ class StsBus(ServosSide[StsServo]):
             self.alive_ns = self._now_ns
             self._handle(request)
 
+    def receive_foreign(self, packet: bytes, shown: bool) -> None:
+        """Take a whole packet of another master; it takes its time on the wire."""
+        self._occupy(len(packet), self.host_baud_rate or BAUD_RATES[0])
+        if shown:
+            self._replies.append((self._free_ns, packet))
+        for request in RequestParser().feed(packet):
+            self._handle(request)
+
     def _advance(self) -> None:
         # The servos' protections follow the time.
         for servo in self.servos:

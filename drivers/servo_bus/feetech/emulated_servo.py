@@ -24,6 +24,7 @@ from deal_hw.drivers.servo_bus.feetech import registers as r
 from deal_hw.drivers.servo_bus.feetech import sts3215
 from deal_hw.drivers.servo_bus.feetech.packets import Fault
 from deal_hw.drivers.servo_bus.registers import Register
+from deal_hw.drivers.servo_bus.servos_side import TWIN_TICKS
 
 BOOT_NS: Final = 800_000_000
 """How long a starting servo is silent [ns]."""
@@ -72,6 +73,13 @@ class StsServo:
         self.keep(r.ID, servo)
         self.keep(r.BAUD_RATE, r.BAUD_RATES.index(baud_rate))
         self._start()
+
+    def twin(self) -> StsServo:
+        """Return another servo with the same id, without torque, which stands elsewhere."""
+        twin = StsServo(self.id, self.baud_rate, model=self.get(r.MODEL_NUMBER))
+        twin.sense(self._shaft + TWIN_TICKS)
+        twin.forget_turns()
+        return twin
 
     def get(self, register: Register) -> int:
         """Return a register, with its sign if it has one."""
