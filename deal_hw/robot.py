@@ -30,7 +30,7 @@ class Robot(abc.ABC):
     """Whether ``home`` moves the motors by this driver's commands; a run must then end passive."""
 
     lowers: ClassVar[bool] = False
-    """Whether :meth:`lower` brings it to a pose in which it may go limp."""
+    """Whether :meth:`lower` keeps it from falling at its end."""
 
     condition: ClassVar[str] = ""
     """What an operator must see to before the robot is commanded, as a sentence that no sensor confirms; "":
@@ -109,15 +109,20 @@ class Robot(abc.ABC):
             SafetyError: Another program or the robot's own controller has it; the text names it.
         """
 
-    def lower(self, timeout_s: float) -> None:  # noqa: B027
-        """Bring the robot to a pose in which it may go limp, at a planned end, before ``passive``.
+    def lower(self, timeout_s: float) -> str:
+        """Bring the robot to a pose in which it may go limp, before ``passive``.
 
-        Does nothing by default. It is not called after a trip or a stop: then the robot is passive at once.
+        Does nothing by default. It is called at a planned end and at Ctrl-C. After a trip, another signal or
+        a second Ctrl-C the robot is passive at once.
+
+        Returns:
+            "" if it may go limp now. Else what the operator must know: ``passive`` then holds the pose.
 
         Raises:
             TransportTimeoutError: It does not arrive in time.
             SafetyError: The robot reports an error on the way.
         """
+        return ""
 
     def hand_back(self, timeout_s: float) -> None:  # noqa: B027
         """Return the robot to its own controller, after ``passive``; does nothing by default.

@@ -78,6 +78,7 @@ class ServoArm(PolledRobot[ServoBus]):
     """
 
     stopped_by = "the servos' supply switch"
+    lowers: ClassVar[bool] = True
     source: ClassVar[str] = "robot.yaml"
     info: ArmInfo | None
 
@@ -96,7 +97,6 @@ class ServoArm(PolledRobot[ServoBus]):
         self._take_hardware(hardware)
         self._ids = tuple(servo.id for servo in self._servos)
         self._rest = tuple(servo.rest for servo in self._servos)
-        self.lowers = None not in self._rest  # type: ignore[misc]
         self.watchdog_s = family.watchdog_s  # type: ignore[misc]
         fastest = max((v for v in description.limits.trip_velocity if np.isfinite(v)), default=np.inf)
         self._reach = _REACH * fastest / RAD
@@ -120,7 +120,8 @@ class ServoArm(PolledRobot[ServoBus]):
         self._collision = CollisionWatch(self._ids, self._begin_ns)
         self._newest: dict[int, ServoSample] = {}
         self._newest_ns = self._unsound = 0
-        self._doubted = False
+        self._doubted = self._holds = False
+        self._found_limp: FloatArray | None = None
 
     def _examine(self) -> ArmInfo:
         """Find all servos, and check their models and settings; nothing is changed."""
@@ -146,10 +147,12 @@ class ServoArm(PolledRobot[ServoBus]):
             start = self._torque_on(end_ns)
             self._move(start, np.array(self.description.default_position), end_ns)
             self._homed = True
+        except Exception:
+            # Not after the operator's stop, which lowers the arm first.
+            self.passive()
+            raise
         finally:
             self._homing = False
-            if not self._homed:
-                self.passive()
 
     def arm(self, timeout_s: float) -> None:
         """Give torque where the arm is, if it has none; the watchdogs start.
@@ -174,24 +177,39 @@ class ServoArm(PolledRobot[ServoBus]):
         self._sent.clear()
         self._grid.begin()
 
-    def lower(self, timeout_s: float) -> None:
-        """Move all joints on straight lines to their rest positions, slowly.
+    def lower(self, timeout_s: float) -> str:
+        """Move all joints on straight lines to where the arm may go limp, slowly.
+
+        That is the rest pose of robot.yaml, or else the pose in which this run found the arm without torque.
+        An arm that had torque, as after a killed run, has no such pose: it stays where it is.
 
         Raises:
             TransportTimeoutError: It did not arrive, or the servos fell silent.
-            SafetyError: A servo reports an error.
+            SafetyError: A joint does not follow, or a servo reports an error.
         """
         end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        rest = [at for at in self._rest if at is not None]
-        if rest:
-            self._asked = ()
-            self._move(self._codec.positions(self._samples(end_ns)), np.array(rest), end_ns)
+        rest = self._found_limp if None in self._rest else np.array(self._rest, dtype=float)
+        self._asked = ()
+        at = self._codec.positions(self._samples(end_ns))
+        if rest is not None:
+            self._move(at, rest, end_ns)
+            return ""
+        self._bus.post(self._family.goals(self._codec.goals(at)))
+        self._holds = True
+        return (
+            f"{self.description.name} holds its pose with stiff motors, since no pose is known in which it "
+            f"may go limp. Hold the arm, then switch its torque off: deal-hw stop ROBOT --port {self._where}"
+            f". A `rest` of each servo ({self.source}) lets a run lower it"
+        )
 
     def _torque_on(self, end_ns: int) -> FloatArray:
         """Give torque at the measured positions, with the nominal gains; return these, (J,) [rad]."""
         samples = self._clear_faults(end_ns)
         start = self._codec.positions(samples)
         self._check_start(start)
+        self._holds = False
+        if all(sample.torque != ON for sample in samples.values()):
+            self._found_limp = start
         registers = self._codec.at({i: clipped(sample.ticks) for i, sample in samples.items()})
         self._written = None
         while True:
@@ -463,7 +481,7 @@ class ServoArm(PolledRobot[ServoBus]):
     def _status(self, samples: Mapping[int, ServoSample]) -> Status:
         return status_of(
             {
-                Status.ARMED: all(sample.torque == ON for sample in samples.values()),
+                Status.ARMED: not self._holds and all(sample.torque == ON for sample in samples.values()),
                 Status.HOMED: self._homed,
                 Status.HOMING: self._homing,
                 Status.WATCHDOG: self._watchdog or any(sample.tripped for sample in samples.values()),
@@ -507,6 +525,10 @@ class ServoArm(PolledRobot[ServoBus]):
         """
         self._disarm()
         self._homed = False
+        if self._holds:
+            # Lowered to where it is: torque stays, and no watchdog of a servo ends it.
+            self._bus.post(self._family.alive(self._ids, False))
+            return
         state = DAMPING if self._hardware.passive == "damping" else OFF
         self._bus.post([*self._family.alive(self._ids, False), *self._family.torque(self._ids, state)])
 

@@ -11,7 +11,7 @@ import pytest
 from arm_rig import BUSES, Rig
 
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
-from deal_hw.control.process.channel import LOWERING, MAKING_PASSIVE, Outcome
+from deal_hw.control.process.channel import HOMING, LOWERING, MAKING_PASSIVE, Outcome
 from deal_hw.control.safety.passive import make_passive
 from deal_hw.control.safety.safety import Safety
 from deal_hw.drivers.servo_arm.families import OFF, ServoSample
@@ -29,7 +29,7 @@ from deal_hw.motions.behaviours import HoldBehaviour
 from deal_hw.testing.faults import FaultyTransport, OneBadFrame
 from deal_hw.testing.robot_suite import RobotBench, RobotSuite, default_command
 from deal_hw.transport import Message, Transport
-from deal_hw.types import Status
+from deal_hw.types import JointCommand, RobotState, Status
 
 TORQUE = {"dynamixel": r.TORQUE_ENABLE, "feetech": f.TORQUE_ENABLE}
 GOAL = {"dynamixel": r.GOAL_POSITION, "feetech": f.GOAL_POSITION}
@@ -407,12 +407,26 @@ def lowered(tmp_path: Path, bus: str) -> Rig:
     return Rig(tmp_path, bus, servos=rests)
 
 
-def played(rig: Rig, **settings: Any) -> LoopReport:
+class Interrupted(HoldBehaviour):
+    """Holds the start pose; the operator asks for the end in its fifth cycle."""
+
+    def __init__(self, rig: Rig, *, gently: bool) -> None:
+        super().__init__(rig.description)
+        self._rig, self._gently, self._cycles = rig, gently, 0
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        self._cycles += 1
+        if self._cycles == 5:
+            self._rig.loop.request_stop("stopped by a test", gently=self._gently)
+        return super().command(state, time_s)
+
+
+def played(rig: Rig, behaviour: HoldBehaviour | None = None, **settings: Any) -> LoopReport:
     """Hold the start pose for a while by the control loop."""
     config = LoopConfig(duration_s=0.5, **settings)
     loop = ControlLoop(
         rig.robot,
-        HoldBehaviour(rig.description),
+        behaviour or HoldBehaviour(rig.description),
         Safety(rig.description),
         rig.clock,
         lambda record: True,
@@ -449,6 +463,73 @@ def test_a_stop_on_the_way_down_makes_it_passive_at_once(tmp_path: Path, bus: st
     assert report.passive_confirmed
     assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
     assert rig.true_position()[0] < 0.6
+
+
+def test_ctrl_c_lowers_a_raised_arm(tmp_path: Path, bus: str) -> None:
+    """As a planned end does; the run was stopped all the same."""
+    rig = lowered(tmp_path, bus)
+    report = played(rig, Interrupted(rig, gently=True))
+    assert (report.outcome, report.reason) == (Outcome.STOPPED, "stopped by a test")
+    assert report.passive_confirmed and LOWERING in rig.phases
+    np.testing.assert_allclose(rig.true_position(), [1.0, -0.5], atol=0.15)
+    assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
+
+
+def test_any_other_signal_makes_it_passive_at_once(tmp_path: Path, bus: str) -> None:
+    """Such as `deal-hw stop`, which is for emergencies."""
+    rig = lowered(tmp_path, bus)
+    begun_ns = rig.clock.now_ns()
+    report = played(rig, Interrupted(rig, gently=False))
+    assert report.outcome is Outcome.STOPPED and report.passive_confirmed and LOWERING not in rig.phases
+    assert rig.clock.now_ns() - begun_ns < 5e9
+
+
+def test_ctrl_c_on_the_way_to_the_start_pose_lowers_the_arm(tmp_path: Path, bus: str) -> None:
+    """It does not drop half-way up: it goes back to where it was found limp."""
+    rig = Rig(tmp_path, bus)
+    start = np.array([0.9, -0.7])
+    rig.device._batch.set_state(start[None], np.zeros((1, 2)))
+    goals, asked = rig.robot._family.goals, []
+
+    def interrupted(ticks: Any) -> Any:
+        if rig.phases[-1:] == [HOMING] and not asked and rig.true_position()[0] < 0.5:
+            asked.append(1)
+            rig.loop.request_stop("stopped by a test", gently=True)
+        return goals(ticks)
+
+    rig.robot._family.goals = interrupted  # type: ignore[method-assign]
+    report = played(rig)
+    assert report.outcome is Outcome.STOPPED and report.passive_confirmed
+    np.testing.assert_allclose(rig.true_position(), start, atol=0.15)
+
+
+def test_an_arm_without_a_rest_pose_goes_back_to_where_it_was_found_limp(tmp_path: Path, bus: str) -> None:
+    """That it lay there without torque shows that it may."""
+    rig = Rig(tmp_path, bus)
+    start = np.array([0.8, -0.6])
+    rig.device._batch.set_state(start[None], np.zeros((1, 2)))
+    report = played(rig)
+    assert report.outcome is Outcome.FINISHED and report.warnings == ()
+    np.testing.assert_allclose(rig.true_position(), start, atol=0.15)
+
+
+def test_an_arm_that_was_stiff_holds_its_pose_at_the_end(tmp_path: Path, bus: str) -> None:
+    """As after a killed run: no pose is known in which it may go limp, so it does not drop."""
+    rig = Rig(tmp_path, bus)
+    rig.armed()
+    rig.run(60, target=0.5)
+    rig.robot.disconnect()
+    report = played(rig)
+    assert report.outcome is Outcome.FINISHED and report.passive_confirmed
+    assert "holds its pose with stiff motors" in report.warnings[0]
+    assert "deal-hw stop ROBOT --port" in report.warnings[0]
+    rig.virtual.open()
+    rig.advance(3.0)
+    assert rig.device.mode == "armed"
+    np.testing.assert_allclose(rig.true_position(), [0.0, 0.0], atol=0.1)
+    rig.robot.connect()
+    assert make_passive(rig.robot, rig.clock)
+    assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
 
 
 def test_an_arm_that_cannot_be_lowered_goes_off_all_the_same(tmp_path: Path, bus: str) -> None:

@@ -82,6 +82,7 @@ class LoopReport:
         cycles_sent: Commands sent.
         error: Name of the error's class, after a failure.
         flags: Failed checks of the safety module that ended it.
+        warnings: What the operator must know of the end.
     """
 
     outcome: Outcome
@@ -92,6 +93,7 @@ class LoopReport:
     cycles_sent: int
     error: str = ""
     flags: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -193,7 +195,8 @@ class ControlLoop:
         self._scheduling, self._end = scheduling, end or PlannedEnd()
         self._loop_timing = LoopTiming(clock, robot.description.control_rate_hz)
         self._repeater = Repeater(robot, clock)
-        self._stop_reason = ""
+        self._stop_reason, self._gently = "", False
+        self._warnings: list[str] = []
         self._raise_on_stop = self._connected = self._commanding = False
         self._state: RobotState | None = None
         self._pending: list[RobotState] = []
@@ -203,8 +206,15 @@ class ControlLoop:
         self._passive_flags: tuple[str, ...] = ()
         self._states = self._blind = self._losses = self._sent = self._errors_seen = 0
 
-    def request_stop(self, reason: str = "stopped by the operator") -> None:
-        """End the run; may be called from a signal handler and from the behaviour."""
+    def request_stop(self, reason: str = "stopped by the operator", *, gently: bool = False) -> None:
+        """End the run; may be called from a signal handler and from the behaviour.
+
+        Args:
+            reason: Why, for the operator; the first one counts.
+            gently: Lower a robot that can be lowered before it goes limp, as at a planned end. Another
+                request makes it passive at once.
+        """
+        self._gently = gently and not self._stop_reason
         self._stop_reason = self._stop_reason or reason
         if self._raise_on_stop:
             # Once: a second exception could interrupt the passive route that the first one began.
@@ -233,8 +243,11 @@ class ControlLoop:
             outcome, reason = self._cycles()
             if outcome is Outcome.FINISHED:
                 self._lower()
+            elif outcome is Outcome.STOPPED:
+                self._lower_if_gently()
         except (OperatorStop, KeyboardInterrupt):
             outcome, reason = Outcome.STOPPED, self._stop_reason or "stopped by the operator"
+            self._lower_if_gently()
         except Exception as err:
             reason, error = str(err) or type(err).__name__, type(err).__name__
             if isinstance(err, TransportError) and running:
@@ -258,6 +271,7 @@ class ControlLoop:
             cycles_sent=self._sent,
             error=error,
             flags=self._passive_flags,
+            warnings=tuple(self._warnings),
         )
 
     def _prepare(self) -> None:
@@ -296,6 +310,9 @@ class ControlLoop:
             self._collect_until(self._loop_timing.deadline_ns)
             if self._loop_timing.next_index >= count or self._end.over:
                 break
+            if self._ends_gently:
+                self._safety.stop(self._stop_reason)
+                return Outcome.STOPPED, self._stop_reason
             index, deadline_ns = self._loop_timing.begin()
             self._progress(RUNNING, self._robot.description.limits.silence_s)
             verdict = self._cycle(index, deadline_ns)
@@ -441,10 +458,15 @@ class ControlLoop:
             state=self._state,
             action_age_ns=action_age_ns,
             transport_errors=self._robot.transport_errors,
-            stop_reason=self._stop_reason or self._robot.operator_stop,
+            stop_reason=("" if self._ends_gently else self._stop_reason) or self._robot.operator_stop,
             command_age_ns=now_ns - sent_ns if sent_ns >= 0 else -1,
             fault=self._robot.fault,
         )
+
+    @property
+    def _ends_gently(self) -> bool:
+        """Whether the operator's stop lowers the robot first; commands then end between two cycles."""
+        return self._gently and self._robot.lowers and not self._config.dry_run
 
     def _make_passive(self) -> bool:
         """Send the passive command until the robot confirms it; return whether it did.
@@ -467,19 +489,26 @@ class ControlLoop:
 
     def _lower(self) -> None:
         """Bring a robot that can to a pose in which it may go limp; a stop ends this at once."""
-        if not self._robot.lowers or self._config.dry_run:
+        if not self._robot.lowers or self._config.dry_run or not self._commanding:
             return
         self._progress(LOWERING, LOWER_TIMEOUT_S + 2.0)
         try:
             self._raise_on_stop = True
-            if self._stop_reason:
+            if self._stop_reason and not self._gently:
                 raise OperatorStop(self._stop_reason)
-            self._robot.lower(LOWER_TIMEOUT_S)
-            self.note("lowered", "the robot is where it may go limp")
+            holds = self._robot.lower(LOWER_TIMEOUT_S)
+            self.note("lowered", holds or "the robot is where it may go limp")
+            self._warnings += [holds] if holds else []
         except DealHwError as err:
             self.note("warning", f"the robot was not lowered before its motors went off: {err}")
         finally:
             self._raise_on_stop = False
+
+    def _lower_if_gently(self) -> None:
+        """The same after the operator's stop; another stop, or a bug, leaves it at being passive."""
+        if self._ends_gently:
+            with contextlib.suppress(OperatorStop, KeyboardInterrupt, Exception):
+                self._lower()
 
     def _hand_back(self) -> None:
         if not self._config.hand_back or self._config.dry_run or not self._connected:

@@ -49,7 +49,7 @@ class _Stopper:
     def _handle(self, number: int) -> None:
         again, self.reason = bool(self.reason), self.reason or self._why(number)
         if self.loop is not None:
-            self.loop.request_stop(self.reason)
+            self.loop.request_stop(self.reason, gently=number == signal.SIGINT)
         elif not again:
             # Once: a second exception could come out where the first one is being answered.
             raise KeyboardInterrupt
@@ -147,7 +147,7 @@ def _run(
             if key == END_KEY and plan.stand:
                 end.request("ended by the operator's key")
             elif key == END_KEY:
-                loop.request_stop("stopped by the operator's key")
+                loop.request_stop("stopped by the operator's key", gently=True)
             elif isinstance(source, KeyboardVelocity):
                 source.press(key)
 
@@ -178,7 +178,8 @@ def _run(
         # Its exception was lost in a callback of a library.
         loop.request_stop(stopper.reason)
     watchdog.start()
-    return {**loop.run().to_json(), "warnings": list(granted.warnings)}
+    report = loop.run()
+    return {**report.to_json(), "warnings": [*granted.warnings, *report.warnings]}
 
 
 def _discard(record: object) -> bool:
