@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.physical import check_amount
 from deal_hw.reading import numbers
 from deal_hw.schema import FINITE, OPEN, from_values
 from deal_hw.types import FloatArray
@@ -26,8 +27,8 @@ FORMAT = "deal_hw.parameter_distribution/1"
 """Format name of a distribution's JSON."""
 LONGEST_LATENCY_S = 1.0
 """Longest total latency [s]."""
-_LARGEST_VARIANCE = 1e100
-"""Above this variance, sums of squares overflow."""
+_LARGEST_STD = 1e12
+"""Largest standard deviation, in a parameter's own scale; on either scale it says nothing of the value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,6 +162,8 @@ class Parameter:
                 f"parameter {self.name!r}: a log scale needs a positive range, "
                 f"got low={self.low:g} {self.unit}"
             )
+        for end in (self.low, self.high):
+            check_amount(f"parameter {self.name!r}: an end of its range", end, self.unit)
         if not self.low <= self.nominal <= self.high:
             raise ConfigurationError(
                 f"parameter {self.name!r}: the nominal value {self.nominal:g} lies outside "
@@ -176,9 +179,10 @@ class Parameter:
             )
         if self.prior_mean is None or self.prior_std is None:
             return
-        if not (np.isfinite(self.prior_std) and self.prior_std > 0):
+        if not 0 < self.prior_std <= _LARGEST_STD:
             raise ConfigurationError(
-                f"parameter {self.name!r}: prior std is {self.prior_std:g}; it must be above 0"
+                f"parameter {self.name!r}: prior std is {self.prior_std:g}; it must be above 0, at most "
+                f"{_LARGEST_STD:g}"
             )
         if not self.low <= self.prior_mean <= self.high:
             raise ConfigurationError(
@@ -520,8 +524,8 @@ def _covariance(values: Any, size: int) -> FloatArray:
         # Nothing is uncertain but the latency: an empty matrix is written as an empty list.
         return np.zeros((0, 0))
     found = numbers(values, "covariance", (size, size))
-    if np.abs(found).max(initial=0.0) > _LARGEST_VARIANCE:
-        raise ConfigurationError(f"covariance contains a value above {_LARGEST_VARIANCE:g}")
+    if np.abs(found).max(initial=0.0) > _LARGEST_STD**2:
+        raise ConfigurationError(f"covariance contains a value above {_LARGEST_STD**2:g}")
     rounding = 1e-9 * np.abs(np.diag(found)).max(initial=0.0)
     if not np.allclose(found, found.T, rtol=1e-6, atol=rounding) or (np.diag(found) < 0).any():
         raise ConfigurationError("covariance is not symmetric, or a variance in it is below 0")
