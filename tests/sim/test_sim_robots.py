@@ -241,7 +241,7 @@ NUMBERS = {
 )
 @pytest.mark.parametrize("old", NUMBERS)
 def test_a_number_that_no_robot_has_is_refused(model: Path, old: str, value: str) -> None:
-    """A velocity limit of 1e308 would be none; each number is refused by name, before the MJCF is compiled."""
+    """A velocity limit of 1e308 would be none; each number is refused by its name."""
     path = written(model)
     text = path.read_text(encoding="utf-8")
     assert old in text

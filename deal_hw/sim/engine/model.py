@@ -14,7 +14,7 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.laws.commands import Filters
 from deal_hw.sim.parameters import apply_parameters, present
 from deal_hw.sim.parameters.drive import JointDrive, filtered, find_drive
@@ -121,7 +121,7 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
         ConfigurationError: The MJCF does not compile, or the device period is no multiple of the step.
         UnknownNameError: A joint of the description is not in the model.
     """
-    model = load_mjcf(description.mjcf)
+    model = compile_mjcf(description.mjcf)
     if step_s is None:
         # Two robots may share an MJCF whose step fits only one of them.
         steps = 1.0 / (description.device_rate_hz * model.opt.timestep)
