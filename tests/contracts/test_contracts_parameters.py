@@ -195,7 +195,7 @@ def damaged(**changes: Any) -> dict[str, Any]:
     ("changes", "field"),
     [
         ({"mean": {"a": float("nan"), "b": 0.0}}, "mean"),
-        ({"mean": {"a": -1.0, "b": 0.0}}, "mean of 'a'"),
+        ({"mean": {"a": -1.0, "b": 0.0}}, "mean.a is -1"),
         ({"mean": {"a": [1.0], "b": 0.0}}, "mean"),
         ({"covariance": [[float("nan"), 0.0], [0.0, 1.0]]}, "covariance"),
         ({"covariance": [[1e300, 0.0], [0.0, 1.0]]}, "covariance"),
