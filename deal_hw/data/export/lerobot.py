@@ -78,6 +78,11 @@ def export_lerobot(
     first = trajectories[0]
     if any((t.joint_names, t.actuated) != (first.joint_names, first.actuated) for t in trajectories):
         raise DatasetError("the recordings have different joints; export those of one robot at a time")
+    if not first.actuated:
+        raise DatasetError(
+            "no joint of the robot has an actuator, and every frame of LeRobot's format has an action; use "
+            "--format foxglove"
+        )
     tables = [table_of(trajectory, f"recording {number}") for number, trajectory in enumerate(trajectories)]
     period = common_period(tables)
     episodes = []

@@ -189,8 +189,9 @@ def filters_of(model: mujoco.MjModel, actuators: Sequence[int], scale: FloatArra
         actuators: The actuators, A of them.
         scale: From :func:`command_scale`.
     """
-    rows = list(actuators)
-    on = np.array([filtered(model, i) for i in rows])
+    # With their types, since a model may have no actuator.
+    rows = np.array(actuators, dtype=np.int64)
+    on = np.array([filtered(model, int(i)) for i in rows], dtype=bool)
     limited = on & np.array(model.actuator_ctrllimited[rows], dtype=bool)
     ends = np.sort(model.actuator_ctrlrange[rows] * scale[:, None], axis=1)
     return Filters(

@@ -166,10 +166,6 @@ class RobotFile:
         names = [joint.name for joint in self.joints]
         if not 0 < len(names) <= NAMES or len(set(names)) != len(names):
             raise refusal("joints", names, "each joint once, at least one")
-        if all(joint.actuator is None for joint in self.joints):
-            raise ConfigurationError(
-                "no joint has an actuator; write `actuator: {...}` for those that take commands"
-            )
         if self.physics_step is not None and not 1e-6 <= self.physics_step <= 1:
             raise refusal("physics_step", self.physics_step, "the MJCF's timestep, 1e-6 to 1 s, or null")
         self._check_hardware()
