@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, short, shown
-from deal_hw.findings import Finding
+from deal_hw.findings import Finding, SafeChecks
 from deal_hw.parameters import (
     LONGEST_LATENCY_S,
     Parameter,
@@ -33,6 +33,8 @@ Z90 = 1.6448536269514722
 EXPLAINED_CHI2 = 1.3
 """Mean squared residual over its expected variance up to which a model explains its recordings [-]."""
 RESULT_FILE = "result.json"
+FAILED_CHECKS = "checks_failed"
+"""Entry of a result's provenance: why checks failed, by their names."""
 RESULT_FORMAT = "deal_hw.calibration_result/1"
 _LARGEST = 1e100
 """Largest amount of a number in a file: beyond it, sums of squares overflow."""
@@ -60,6 +62,7 @@ class Progress:
         values: Further values of this generation or iteration, as in the result's trace.
         estimate: A complete fit, (K,) physical values, with ``latency_s``; None within a search or a fit.
         space: Its parameters: at least those of the calibration; None: these.
+        fitted: The fit that the result will have, with its intervals, before the checks; None before that.
     """
 
     stage: str
@@ -71,6 +74,7 @@ class Progress:
     values: Mapping[str, float] = field(default_factory=dict)
     estimate: FloatArray | None = None
     space: ParameterSpace | None = None
+    fitted: CalibrationResult | None = None
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -138,6 +142,8 @@ class CalibrationResult:
         steps: Simulated physics steps.
         seconds: Wall clock [s].
         provenance: Versions, digests, settings, seed: plain JSON values.
+        unchecked: Whether it is a fit whose checks were not made, or not to their end. The first alarm says
+            why, and what to do.
     """
 
     method: str
@@ -159,6 +165,7 @@ class CalibrationResult:
     steps: int = 0
     seconds: float = 0.0
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    unchecked: bool = False
 
     @property
     def without_value(self) -> tuple[str, ...]:
@@ -172,6 +179,18 @@ class CalibrationResult:
         if name in self.without_value:
             return "no value"
         return f"{self.estimate[self.space.names.index(name)]:.4g}"
+
+    def with_unchecked(self, alarm: Finding) -> CalibrationResult:
+        """Return it as a fit whose checks were not made; the alarm says why."""
+        return replace(self, unchecked=True, alarms=(alarm, *self.alarms))
+
+    def with_failed(self, checks: SafeChecks) -> CalibrationResult:
+        """Return it with the failed checks among its alarms and in its provenance."""
+        if not checks.failed:
+            return self
+        failed = {**self.provenance.get(FAILED_CHECKS, {}), **checks.failed}
+        alarms = (*self.alarms, *checks.alarms)
+        return replace(self, alarms=alarms, provenance={**self.provenance, FAILED_CHECKS: failed})
 
     def restricted(self, space: ParameterSpace) -> CalibrationResult:
         """Return the result of a space's parameters alone, which come first; others were added to it."""
@@ -229,6 +248,7 @@ class CalibrationResult:
             "heldout_nrmse": dict(self.heldout_nrmse),
             "steps": self.steps,
             "seconds": self.seconds,
+            "unchecked": self.unchecked,
             "provenance": dict(self.provenance),
         }
         return dict(plain(values))
@@ -252,8 +272,12 @@ class CalibrationResult:
             row.check(space, name)
         _check_mentions(space, found)
         _check_amounts("provenance", values["provenance"])
-        if "shared_error" in values["provenance"] and not found.alarms:
-            raise ConfigurationError("field provenance.shared_error has no alarm beside it")
+        for place, there in (
+            ("provenance.shared_error", "shared_error" in values["provenance"]),
+            ("unchecked", found.unchecked),
+        ):
+            if there and not found.alarms:
+                raise ConfigurationError(f"field {place} has no alarm beside it")
         bounds = [[row.low, row.high] for row in rows] if K else np.empty((0, 2))
         low_s, high_s = numbers(found.latency_interval_s, "latency_interval_s", (2,), finite=False)
         return cls(
@@ -274,6 +298,7 @@ class CalibrationResult:
             steps=int(number(found.steps, "steps", 0.0, _MOST_STEPS)),
             seconds=number(found.seconds, "seconds", 0.0, _MOST_SECONDS),
             provenance=values["provenance"],
+            unchecked=found.unchecked,
         )
 
 
@@ -412,8 +437,9 @@ class _ResultFile:
     provenance: _Provenance
     biased: dict[str, str] = field(default_factory=dict)
     known: dict[str, float] | None = None
-    # Results from before advice existed have none.
+    # Results from before advice and unchecked results existed have neither.
     advice: tuple[_Advice, ...] = ()
+    unchecked: bool = False
 
     def __post_init__(self) -> None:
         told = [name for name, row in self.parameters.items() if row.verdict is not None]

@@ -217,8 +217,8 @@ class RobotDescription:
         """
         if not self.actuated:
             raise ConfigurationError(
-                f"no joint of {self.name!r} has an actuator, so nothing can be commanded: its recordings can be "
-                "imported, calibrated and inspected. To move it, give its MJCF actuators"
+                f"no joint of {self.name!r} has an actuator, so nothing can be commanded: its recordings can "
+                "be imported, calibrated and inspected. To move it, give its MJCF actuators"
             )
 
     @property

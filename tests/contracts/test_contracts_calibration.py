@@ -204,6 +204,7 @@ CONTRADICTIONS: dict[str, tuple[dict[str, Any], str]] = {
         {"provenance.shared_error": {}, "alarms": []},
         "shared_error has no alarm beside it",
     ),
+    "unchecked without a reason": ({"unchecked": True, "alarms": []}, "field unchecked has no alarm"),
     "a verdict for some": ({"parameters.arm.mass.verdict": None}, "some of the parameters have a verdict"),
 }
 
