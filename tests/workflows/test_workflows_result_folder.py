@@ -132,7 +132,10 @@ def test_an_error_after_the_first_fit_makes_that_fit_the_result(
     assert found.unchecked and found.method == "interrupted after local fit"
     assert found.estimate[found.space.names.index("hub.damping")] == pytest.approx(0.004, rel=0.1)
     values = json.loads((tmp_path / "calibration" / "result.json").read_text(encoding="utf-8"))
-    assert values["verdict"] in ("amber", "red") and "was not checked" in values["verdict_reason"]
+    assert (
+        values["verdict"] in ("amber", "red")
+        and "Checks of this result were not made" in values["verdict_reason"]
+    )
     assert not (tmp_path / "calibration" / "so_far").exists()
 
 
@@ -279,12 +282,14 @@ def test_an_unchecked_result_is_read_again(tmp_path: Path) -> None:
         method="m", space=SPACE, estimate=np.array([1.0]), interval=np.array([[0.9, 1.1]]), chi2=1.0,
         heldout_nrmse={"nominal": 0.5, "calibrated": 0.1},
     )  # fmt: skip
-    marked = unfinished(found, "It was stopped.", "Go on.")
+    marked = unfinished(found, "was stopped", "Go on.")
     again = CalibrationResult.from_json(json.loads(json.dumps(marked.to_json())))
-    assert again.unchecked and again.alarms[0].seen == "It was stopped."
+    assert again.unchecked and again.alarms[0].seen == "The calibration was stopped."
     assert deal_hw.calibration.CalibrationResult is CalibrationResult
     from deal_hw.calib.report.verdict import trust
 
     assert trust(found).colour == "green"
     verdict = trust(again)
-    assert verdict.colour == "amber" and "It was not checked" in verdict.means and verdict.do == "Go on."
+    assert (
+        verdict.colour == "amber" and "No interval was computed" in verdict.means and verdict.do == "Go on."
+    )

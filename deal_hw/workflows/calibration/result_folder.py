@@ -155,18 +155,24 @@ class UnfinishedCalibrationError(CalibrationError):
         self.result = result
 
 
-def unfinished(result: CalibrationResult, seen: str, next_step: str) -> CalibrationResult:
+def unfinished(result: CalibrationResult, how: str, next_step: str) -> CalibrationResult:
     """Return a fit as one whose checks were not made.
 
     Args:
         result: The fit.
-        seen: Why they were not made, as a sentence.
+        how: How its calibration ended, as the end of a sentence.
         next_step: How it goes on, as a sentence.
     """
-    means = "It was not checked, and no interval was computed: the given ones are the search ranges."
+    intervals = "No interval was computed: the given ones are the search ranges."
     if result.covariance is not None:
-        means = "Its checks were not made, or not to their end: its intervals are those of the fit."
-    return result.with_unchecked(Finding.alarm(seen, means, next_step))
+        intervals = "Its intervals are those of the fit."
+    return result.with_unchecked(
+        Finding.alarm(
+            f"The calibration {how}.",
+            f"Checks of this result were not made, or not to their end. {intervals}",
+            next_step,
+        )
+    )
 
 
 class BestSoFar:
@@ -228,13 +234,13 @@ class BestSoFar:
     @property
     def result(self) -> CalibrationResult | None:
         """The best fit so far, as one whose checks were not made; None before the first fit."""
-        return None if self._best is None else self.ended("The calibration was not finished")
+        return None if self._best is None else self.ended("was not finished")
 
-    def ended(self, why: str, do: str = "") -> CalibrationResult:
+    def ended(self, how: str, do: str = "") -> CalibrationResult:
         """Return the best fit so far of a calibration that ended before its time.
 
         Args:
-            why: Why it ended, in words.
+            how: How it ended, as the end of a sentence.
             do: What to do before it goes on, as a sentence.
 
         Raises:
@@ -243,8 +249,8 @@ class BestSoFar:
         if self._best is None:
             raise ValueError("no fit was found yet")
         after_s = time.monotonic() - self._began
-        seen = f"{why}: this is the result of its {self._best.method}, after {after_s:.0f} s."
-        found = unfinished(self._best, seen, f"{do} {self._next_step()}".strip())
+        how = f"{how}: this is the result of its {self._best.method}, after {after_s:.0f} s"
+        found = unfinished(self._best, how, f"{do} {self._next_step()}".strip())
         return dataclasses.replace(found, method=f"interrupted after {self._best.method}", seconds=after_s)
 
     def take(self, fitted: CalibrationResult) -> None:

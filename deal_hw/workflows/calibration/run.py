@@ -267,14 +267,15 @@ def calibrate_episodes(
             result = searcher.run(problem, budget, rng, best, store)
         except KeyboardInterrupt:
             if results is not None and best.result is not None:
-                results.write(robot, best.ended("The calibration was stopped"), stopped=True)
+                results.write(robot, best.ended("was stopped"), stopped=True)
                 to_stderr(f"\nbest so far: {best.sentence}; written to {results.so_far}, not checked")
             raise
         except Exception as err:
             if best.result is None or err is best.raised:
                 raise
-            why = f"The calibration ended by an error, {findings.reason_of(err)}"
-            raise UnfinishedCalibrationError(why, best.ended(why, "Report this error.")) from err
+            how = f"ended by an error, {findings.reason_of(err)}"
+            ended = best.ended(how, "Report this error.")
+            raise UnfinishedCalibrationError(f"the calibration {how}", ended) from err
         best.take(result)
     safely = SafeChecks()
     from deal_hw.calib.validation.checks import latency_alarms
@@ -354,8 +355,8 @@ def finish(
         try:
             judgement = judged(work, result, settings, page=page, advise=advise, threads=threads)
         except KeyboardInterrupt:
-            why = "The calibration was stopped after its fit, before advice and report."
-            results.write(work.robot, unfinished(result, why, results.next_step), stopped=True)
+            how = "was stopped after its fit, before advice and report"
+            results.write(work.robot, unfinished(result, how, results.next_step), stopped=True)
             to_stderr(f"\nthe fit is written to {results.so_far}")
             raise
     result, report = judgement
