@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-_PR_SET_PDEATHSIG = 1
+from deal_hw.child_process import signal_at_end_of_parent
+
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
 """Signal that the kernel sends when the parent dies. Another program may send it, too: see
@@ -122,21 +123,9 @@ def _lock_memory() -> str | None:
 def die_with_parent(parent_pid: int) -> None:
     """Have the kernel send ``PARENT_DIED`` when the parent dies, so that the loop ends by its passive route.
 
-    Only the signal's number is reliable: with several threads in the parent, the first one to end sends it,
-    and ``getppid`` still names the parent.
-
-    Args:
-        parent_pid: The parent's process id, as the parent gave it.
-
-    Raises:
-        ProcessLookupError: The parent has already ended.
+    See :func:`deal_hw.child_process.signal_at_end_of_parent`.
     """
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, PARENT_DIED, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    # The parent may have died before the call above; then no signal ever comes.
-    if os.getppid() != parent_pid:
-        raise ProcessLookupError(f"the parent process {parent_pid} has ended")
+    signal_at_end_of_parent(parent_pid, PARENT_DIED)
 
 
 def parent_is_gone(parent_pid: int) -> bool:
