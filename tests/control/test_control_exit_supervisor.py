@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import signal
@@ -18,9 +19,10 @@ import pytest
 from deal_hw.clock import VirtualClock
 from deal_hw.control.process import supervisor as module
 from deal_hw.control.process.channel import Beat
-from deal_hw.control.process.realtime import SUPERVISOR_PRIORITY
+from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.supervisor import ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
+from deal_hw.priorities import SUPERVISOR_PRIORITY
 from deal_hw.signals import OPERATOR, SUSPENDED
 
 pytestmark = pytest.mark.real_time
@@ -287,6 +289,68 @@ def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None
         "opened": True,
         "parent": os.getpid(),
     }
+
+
+def _noted(note: RunNote) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(os.pread(note.fileno(), 4096, 0))
+    return found
+
+
+def test_other_programs_read_how_the_run_is() -> None:
+    """Whether the robot is passive, as soon as that is known, and until when the supervisor is silent."""
+    noted: list[tuple[bool | None, bool]] = []
+    with RunNote("go2", {}) as note:
+
+        def look(run: Run, beat: Beat) -> None:
+            facts = _noted(note)
+            noted.append((facts["passive"], facts["silent_until_ns"] > beat.stamp_ns))
+
+        run = Run(
+            "beat('running'); time.sleep(0.2); result(passive_confirmed=True, opened=os.path.realpath("
+            f"'/proc/self/fd/{note.fileno()}'))",
+            look,
+            note=note,
+        )
+        end = run.end()
+        assert end.result is not None and "deal-hw-run:go2" in end.result["opened"]
+        assert noted == [(None, True)]
+        assert _noted(note)["passive"] is True
+        assert not run.supervisor.was_away
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_the_note_says_what_the_supervisor_reached(confirmed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the control process is dead: its own attempt counts."""
+    with RunNote("go2", {}) as note:
+        run = Run("beat('running'); os.kill(os.getpid(), 9)", note=note)
+        monkeypatch.setattr(run.supervisor, "_passive", lambda phase, tried: confirmed)
+        assert run.end().passive_confirmed is confirmed
+        assert _noted(note)["passive"] is confirmed
+
+
+def test_a_supervisor_notices_that_it_did_not_run() -> None:
+    """For more than 0.8 s between two looks, to the nanosecond: then others may have taken the robot."""
+
+    class Jumping(VirtualClock):
+        jump_ns = 0
+
+        def now_ns(self) -> int:
+            """Jump once, as for a process that was stopped."""
+            self.advance_ns(self.jump_ns)
+            self.jump_ns = 0
+            return super().now_ns()
+
+    for jump_ns, away in ((800_000_000, False), (800_000_001, True)):
+        clock = Jumping()
+
+        def stop(run: Run, beat: Beat, clock: Jumping = clock, jump_ns: int = jump_ns) -> None:
+            clock.jump_ns = jump_ns if beat.phase == "running" else 0
+
+        do = "beat('homing'); channel.recv(1); beat('running'); channel.recv(1); "
+        do += "result(passive_confirmed=True)"
+        run = Run(do, stop, clock=clock)
+        assert run.end().passive_confirmed
+        assert run.supervisor.was_away is away
 
 
 def test_the_process_has_a_group_of_its_own_and_ordinary_priority() -> None:

@@ -24,6 +24,7 @@ VOCABULARY = (
     "install",
     "on_use",
     "documentation",
+    "priorities",
     "ranges",
     "rotations",
     "child_process",

@@ -33,6 +33,7 @@ from deal_hw.robots.connect import on_this_computer
 from deal_hw.signals import OPERATOR, name
 from deal_hw.version import __version__
 from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
+from deal_hw.workflows.running.commander import OTHERS_S
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.sleep_lock import ASLEEP
@@ -67,8 +68,7 @@ class EpisodeRun:
         say: Say = silent,
         note: RunNote | None = None,
     ) -> None:
-        self._note, self._say = note, say
-        self._keep_fds = keep_fds if note is None else (*keep_fds, note.fileno())
+        self._note, self._say, self._keep_fds = note, say, keep_fds
         self.signal = ""
         """Name of the signal by which the operator ended it, or ""."""
         self._supervisor: Supervisor | None = None
@@ -110,10 +110,11 @@ class EpisodeRun:
             module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
-            passive=lambda phase, already_tried: self._make_passive(phase, already_tried, on_beat),
+            passive=lambda phase, tried: self._make_passive(supervisor, phase, tried, on_beat),
             recorder=recorder,
             on_beat=on_beat,
             keep_fds=self._keep_fds,
+            note=self._note,
         )
         if self._stop_cause:
             supervisor.stop(self._stop_cause)
@@ -122,9 +123,7 @@ class EpisodeRun:
                 from deal_hw.workflows.running.keyboard import keys
 
                 listening.enter_context(keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say))
-            self._say_passive(None)
             end = supervisor.run()
-            self._say_passive(end.passive_confirmed)
         self.signal = end.signal
         report = dataclasses.replace(
             account(
@@ -166,10 +165,6 @@ class EpisodeRun:
         if self._supervisor is not None:
             self._supervisor.stop(cause)
 
-    def _say_passive(self, passive: bool | None) -> None:
-        if self._note is not None:
-            self._note.say_passive(passive)
-
     def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""
         if not robot_entry(self._plan.robot).odometry:
@@ -194,7 +189,9 @@ class EpisodeRun:
         before_s = self._plan.posture.before_s if self._plan.stand else 0.0
         return replay_error(read_trajectory(Path(self._plan.recording)), trajectory, before_s)
 
-    def _make_passive(self, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]) -> bool:
+    def _make_passive(
+        self, supervisor: Supervisor, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]
+    ) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""
         untouched = (
             STARTING,
@@ -208,8 +205,12 @@ class EpisodeRun:
         clock = MonotonicClock()
 
         def tell(text: str, silence_s: float) -> None:
+            supervisor.promise(silence_s)
             on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
 
+        if supervisor.was_away and (who := self._robot.other_commander(OTHERS_S)):
+            self._say(f"not made passive after this program was stopped: {who}")
+            return False
         config = _TRIED_AGAIN if already_tried else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
         return make_passive(self._robot, clock, config, progress=tell)
 

@@ -1,0 +1,14 @@
+"""Real-time priorities (SCHED_FIFO) of the processes of a run and beside it, a higher one first."""
+
+from __future__ import annotations
+
+from typing import Final
+
+FIFO_PRIORITY: Final = 50
+"""Of the control process."""
+SUPERVISOR_PRIORITY: Final = FIFO_PRIORITY + 1
+"""Above the control process, since it must be able to kill one that blocks a processor."""
+TRANSPORT_PRIORITY: Final = FIFO_PRIORITY - 10
+"""Of the supervisor's transport threads, because damping must be sent on a busy machine, too."""
+STOP_PRIORITY: Final = TRANSPORT_PRIORITY - 10
+"""Of ``deal-hw stop``: above all ordinary programs, and below all that make a robot passive."""
