@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from deal_hw import load
 from deal_hw.clock import VirtualClock
 from deal_hw.control.process import supervisor as module
 from deal_hw.control.process.channel import Beat
@@ -419,8 +420,9 @@ def test_the_supervisor_wakes_up_as_soon_as_a_sign_of_life_is_overdue(
     assert waits[-2:] == pytest.approx([0.021, 0.001], rel=1e-9)
 
 
-def test_a_process_that_never_beats_has_thirty_seconds() -> None:
-    """To the nanosecond: it is let live at 30 s, and killed 1 ns later."""
+def test_a_process_that_never_beats_has_thirty_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the nanosecond: it is let live at 30 s, and killed 1 ns later. The message says why."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 0.0)
 
     class Late(VirtualClock):
         asked = 0
@@ -432,8 +434,41 @@ def test_a_process_that_never_beats_has_thirty_seconds() -> None:
 
     clock = Late()
     end = Run("time.sleep(30); sys.exit(7)", clock=clock).end()
-    assert (end.killed, end.exit_code) == ("it sent no heartbeat while starting", -9)
+    assert end.killed.startswith(
+        "it sent no heartbeat while starting in its time, 30 s of its own and 0 s in which"
+    )
+    assert end.exit_code == -9
     assert clock.asked > 30
+
+
+@pytest.mark.parametrize("phase", ["starting", "loading"])
+def test_a_busy_computer_gives_a_process_more_time_to_start(
+    phase: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waited for a processor for 40 s. Once it commands, this does not count."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 40.0 if begun else 0.0)
+    begun: list[bool] = []
+
+    class Late(VirtualClock):
+        jumped = False
+
+        def now_ns(self) -> int:
+            """Jump by 60 s, once the process is there."""
+            if begun and not self.jumped:
+                self.jumped = True
+                self.advance_ns(60 * 10**9)
+            return super().now_ns()
+
+    monkeypatch.setattr(Supervisor, "_notice_absence", lambda supervisor: begun.append(True))
+    do = "channel.recv(1)" if phase == "starting" else "beat('loading', 0.0); channel.recv(1)"
+    end = Run(f"{do}; time.sleep(0.2); result(passive_confirmed=True)", clock=Late()).end()
+    assert (end.killed, end.passive_confirmed) == ("", True)
+
+
+def test_a_process_that_commands_gets_no_more_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though it waited for a processor: a robot may be stiff meanwhile."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 40.0)
+    assert Run("beat('homing', 0.02); time.sleep(600)").end().killed == "it sent no heartbeat while homing"
 
 
 @pytest.fixture

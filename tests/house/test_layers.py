@@ -25,6 +25,7 @@ VOCABULARY = (
     "on_use",
     "documentation",
     "priorities",
+    "load",
     "ranges",
     "rotations",
     "child_process",

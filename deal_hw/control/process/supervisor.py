@@ -24,6 +24,7 @@ from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.control.process.channel import (
     BUFFER_BYTES,
     HEARTBEAT,
+    LOADING,
     STARTING,
     Beat,
     StatusReceiver,
@@ -33,11 +34,13 @@ from deal_hw.control.process.realtime import priority, raise_priority
 from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.watchdog import SUPERVISOR_SILENCE_S
 from deal_hw.data.recording.recorder_launch import RecorderHandle, RecorderOutcome
+from deal_hw.load import TimeLimit
 from deal_hw.priorities import SUPERVISOR_PRIORITY
 from deal_hw.signals import held_back, name, reason, taken
 
 START_SILENCE_S = 30.0
-"""How long a new control process may take to import and load before its first heartbeat [s]."""
+"""How long a new control process may take to import and load before its first heartbeat [s], without the time
+in which it waits for a processor."""
 PATIENCE_S = 1.0
 """A control process that was asked to end is killed by a further request only after this time [s]. It needs
 0.25 s at most (measured). A session that ends sends SIGTERM and SIGHUP to each process, and a key that is
@@ -94,6 +97,7 @@ class Supervisor:
     """
 
     _stale_ns: int
+    _limit: TimeLimit
 
     def __init__(
         self,
@@ -207,6 +211,7 @@ class Supervisor:
         if self._stop_cause:
             child.send_signal(signal.SIGTERM)
         self._stale_ns = self._clock.now_ns() + round(START_SILENCE_S * 1e9)
+        self._limit = TimeLimit(child.pid, START_SILENCE_S, self._clock)
         self._status = StatusReceiver(receiver)
         return child, self._status
 
@@ -217,7 +222,7 @@ class Supervisor:
                 status.tell(HEARTBEAT)
                 self.promise(SUPERVISOR_SILENCE_S)
                 self._beat_ns = now_ns + round(_POLL_S * 1e9)
-            left_s = (self._stale_ns - self._clock.now_ns()) * 1e-9
+            left_s = (self._due_ns() - self._clock.now_ns()) * 1e-9
             ready = select.select([status], [], [], min(_POLL_S, max(left_s, 0.0) + 1e-3))[0]
             self._notice_absence()
             if ready:
@@ -225,11 +230,21 @@ class Supervisor:
                     self._take(message)
             # Only after a wait without messages: if the supervisor itself was delayed, old heartbeats are
             # still waiting.
-            elif self._clock.now_ns() > self._stale_ns:
-                self._kill(child, f"it sent no heartbeat while {self._phase}")
+            elif self._clock.now_ns() > self._due_ns():
+                limit = f" in its time, {self._limit}" if self._starts else ""
+                self._kill(child, f"it sent no heartbeat while {self._phase}{limit}")
                 return
             if self._recorder is not None and not self._stop_cause and (errors := self._recorder.errors()):
                 self.stop(f"the recorder failed: {errors[0]}")
+
+    @property
+    def _starts(self) -> bool:
+        """Whether the control process imports and loads, at ordinary priority, and commands nothing yet."""
+        return self._phase in (STARTING, LOADING)
+
+    def _due_ns(self) -> int:
+        """Return when the next heartbeat is overdue [ns]; who starts may wait for a processor longer."""
+        return self._stale_ns + (round(self._limit.waited_s * 1e9) if self._starts else 0)
 
     def _take(self, message: Beat | dict[str, Any]) -> None:
         if isinstance(message, Beat):

@@ -27,12 +27,13 @@ from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.errors import DealHwError
+from deal_hw.load import Load
 from deal_hw.robot import Robot
 from deal_hw.robots import balanced, robot_entry, walked
 from deal_hw.robots.connect import on_this_computer
 from deal_hw.signals import OPERATOR, name
 from deal_hw.version import __version__
-from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
+from deal_hw.workflows.causes import LATE, corrupt_advice, late_advice
 from deal_hw.workflows.running.commander import OTHERS_S
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
