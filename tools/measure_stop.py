@@ -15,10 +15,12 @@ both-stopped     both its processes got SIGSTOP three seconds before
 
 The time counts from just before the new process is made (fork and exec) until the first entry of the
 emulator's log after which the robot does not follow commands any more. A cart-pole's own watchdog stops it
-0.2 s after its run was killed; the row then says that it was passive before. With `--load N`, N processes
-compute beside `stop`, from half a second before its start until its end. `stop` has a session of its own, as
-in another terminal: Linux shares the processors between sessions (autogroup). With `--same-session` it is in
-that of the programs which compute.
+0.2 s after its run was killed; the row then says that it was passive before. `realtime_ms` is the part of the
+time until `stop` has real-time priority.
+
+With `--load N`, N processes compute beside `stop`, from half a second before its start until its end. `stop`
+has a session of its own, as in another terminal: Linux shares the processors between sessions (autogroup).
+With `--same-session` it is in that of the programs which compute.
 """
 
 from __future__ import annotations
@@ -50,10 +52,10 @@ from deal_hw.workflows.emulation.topics import free_port
 
 STATES = ("no-owner", "healthy", "control-stopped", "both-stopped")
 NAMES = ("robot", "state", "busy", "same_session", "repetition")
-_RIG_PRIORITY = 45
+_RIG_PRIORITY = 48
 """Of the thread that causes the state and starts `stop`; it is inherited by none of its processes."""
 _PATIENCE_S = 120.0
-_POLL_S = 0.01
+_POLL_S, _LOOK_S = 0.01, 0.005
 _SETTLED_S = 0.3
 """Until what was sent has arrived, after `stop` has ended [s]."""
 _STOPPED_S = 3.0
@@ -213,6 +215,7 @@ class Bench:
                 text=True,
                 start_new_session=not self.same_session,
             )
+            realtime_ns = _realtime_ns(process)
         printed, _ = process.communicate(timeout=_PATIENCE_S)
         end_ns = time.monotonic_ns()
         time.sleep(_SETTLED_S)
@@ -226,6 +229,7 @@ class Bench:
             "passive": is_passive,
             "passive_before": before == [False],
             "passive_ms": round((passive[0] - begin_ns) * 1e-6, 1) if passive and is_passive else None,
+            "realtime_ms": round((realtime_ns - begin_ns) * 1e-6, 1) if realtime_ns else None,
             "stop_ms": round((end_ns - begin_ns) * 1e-6, 1),
             "exit_code": process.returncode,
             "running": running,
@@ -272,6 +276,16 @@ def _end(process: subprocess.Popen[bytes], control: int) -> None:
         process.wait()
     if control:
         _await(lambda: _gone(control))
+
+
+def _realtime_ns(process: subprocess.Popen[str]) -> int:
+    """Return when a process has got real-time priority [ns]; 0: it ended without."""
+    while process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            if os.sched_getscheduler(process.pid) == os.SCHED_FIFO:
+                return time.monotonic_ns()
+        time.sleep(_LOOK_S)
+    return 0
 
 
 def _await(ready: Any) -> None:

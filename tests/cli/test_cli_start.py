@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from deal_hw.cli import start
 from deal_hw.cli.parsing import read_settings
 from deal_hw.cli.plain_words import plain_settings
 from deal_hw.cli.verbs import VERBS
-from deal_hw.priorities import STOP_PRIORITY, TRANSPORT_PRIORITY
+from deal_hw.priorities import FIFO_PRIORITY, STOP_PRIORITY, TRANSPORT_PRIORITY
 from deal_hw.workflows.kinds import sub_verbs
 from deal_hw.workflows.stopping.settings import STOP
 
@@ -96,7 +97,7 @@ def test_stop_loads_little_until_the_runs_are_asked() -> None:
 def test_an_emergency_stop_asks_for_real_time_first(
     verb: str, asked: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Below all that make a robot passive; a refusal changes nothing."""
+    """Below the two processes that make a robot passive; a refusal changes nothing."""
     seen: list[tuple[int, int, int]] = []
 
     def refuse(pid: int, policy: int, parameters: os.sched_param) -> None:
@@ -108,11 +109,61 @@ def test_an_emergency_stop_asks_for_real_time_first(
     assert start.main() == (2 if asked else 0)
     assert "name the robot" in capsys.readouterr().err or not asked
     assert seen == [(0, os.SCHED_FIFO, STOP_PRIORITY)] * asked
-    assert 0 < STOP_PRIORITY < TRANSPORT_PRIORITY
+    assert TRANSPORT_PRIORITY < STOP_PRIORITY < FIFO_PRIORITY
 
 
-def test_both_ways_to_call_begin_there() -> None:
+COMMAND = Path(start.__file__).with_name("deal-hw")
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    """The command beside its Python part, as pip installs them; `chrt` and that part print what they get."""
+    bins = tmp_path / "bin"
+    bins.mkdir()
+    shutil.copy(COMMAND, bins)
+    for name, exit_code in (("deal-hw-python", 7), ("chrt", 1)):
+        (bins / name).write_text(f'#!/bin/sh\necho "{name} $*" >> {tmp_path}/called\nexit {exit_code}\n')
+        (bins / name).chmod(0o755)
+    return bins
+
+
+def called(command: Sequence[str | Path], bins: Path) -> list[str]:
+    """Run the command; return what it called, the number of its own process as PID."""
+    search = f"{bins}:{os.environ['PATH']}"
+    with subprocess.Popen(command, env={**os.environ, "PATH": search}) as process:
+        assert process.wait(60) == 7, "the exit code is that of the Python part"
+    return (bins.parent / "called").read_text().replace(str(process.pid), "PID").splitlines()
+
+
+def test_an_emergency_stop_has_real_time_priority_before_python_starts(installed: Path) -> None:
+    """A refusal changes nothing: `chrt` fails here."""
+    assert called([installed / "deal-hw", "stop", "go2", "--port", "a b"], installed) == [
+        f"chrt -f -p {STOP_PRIORITY} PID",
+        "deal-hw-python stop go2 --port a b",
+    ]
+
+
+@pytest.mark.parametrize("words", [[], ["collect", "stop"]])
+def test_other_verbs_keep_the_priority_of_the_terminal(words: Sequence[str], installed: Path) -> None:
+    """And without a verb, too."""
+    assert called([installed / "deal-hw", *words], installed) == [f"deal-hw-python {' '.join(words)}"]
+
+
+def test_the_command_finds_its_python_part_behind_a_link(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As pipx makes it; and where the shell got no path."""
+    (installed.parent / "deal-hw").symlink_to(installed / "deal-hw")
+    assert called([installed.parent / "deal-hw", "doctor"], installed) == ["deal-hw-python doctor"]
+    (installed.parent / "called").unlink()
+    monkeypatch.chdir(installed)
+    assert called(["sh", "deal-hw", "doctor"], installed) == ["deal-hw-python doctor"]
+
+
+def test_all_ways_to_call_begin_there() -> None:
     """The installed command, and `python -m deal_hw`."""
     root = Path(__file__).resolve().parents[2]
-    assert 'deal-hw = "deal_hw.cli.start:main"' in (root / "pyproject.toml").read_text()
+    settings = (root / "pyproject.toml").read_text()
+    assert 'deal-hw-python = "deal_hw.cli.start:main"' in settings
+    assert 'script-files = ["deal_hw/cli/deal-hw"]' in settings
     assert "from deal_hw.cli.start import main" in (root / "deal_hw/__main__.py").read_text()

@@ -232,7 +232,7 @@ def test_a_run_that_hangs_is_killed_and_its_robot_made_passive_from_here(
         assert hanging.wait(PATIENCE_S) == -signal.SIGKILL
     printed = capsys.readouterr()
     assert "has ended without a passive robot; making it passive from here" in printed.err
-    assert "cartpole is passive" in printed.out
+    assert "cartpole is passive: its run was killed" in printed.out
     assert "listening" not in printed.err
 
 
@@ -308,7 +308,7 @@ def test_a_go2_is_damped_whoever_holds_it(
     assert main(["stop", "go2", "--port", robot.emulator.port, *wire]) == 0
     printed = capsys.readouterr()
     assert "listening for other commanders for 0.8 s before anything is sent" in printed.err
-    assert "no run commanded it, and it has confirmed it" in printed.out
+    assert "no run commanded it, and the robot has confirmed it" in printed.out
     assert robot.reported()[-1] == DAMPING
 
     # Nothing here may wait for the end of a fixed time.

@@ -203,12 +203,13 @@ def _directly(settings: StopSettings, clock: Clock, say: Say, *, after_run: bool
     try:
         with contextlib.ExitStack() as held:
             held.callback(_claimed(_claim(settings), clock).release)
-            claim = wire_claim(settings.robot, transport, settings.port, clock, who(), wire_of(settings))
             if after_run:
                 held.enter_context(robot)
                 if others := robot.other_commander(OTHERS_S):
                     return report(False, f"{settings.robot} was NOT made passive: {others}")
             else:
+                wire = wire_of(settings)
+                claim = wire_claim(settings.robot, transport, settings.port, clock, who(), wire)
                 listen_s = max(robot.listen_s, getattr(claim, "listen_s", 0.0))
                 if listen_s:
                     say(
@@ -219,9 +220,8 @@ def _directly(settings: StopSettings, clock: Clock, say: Say, *, after_run: bool
                 _check_free(robot, claim, held)
             config = PassiveConfig(timeout_s=settings.seconds)
             if make_passive(robot, clock, config, progress=lambda text, silence_s: say(text)):
-                return report(
-                    True, f"{settings.robot} is passive: no run commanded it, and it has confirmed it"
-                )
+                why = "its run was killed" if after_run else "no run commanded it"
+                return report(True, f"{settings.robot} is passive: {why}, and the robot has confirmed it")
     except ConfigurationError:
         raise
     except DealHwError as error:
