@@ -41,7 +41,7 @@ class DriveModes:
         self._off_states = self._off_states + 1 if off.any() else 0
         if self._off_states < OFF_STATES:
             return ""
-        names = ", ".join(repr(self._joints[joint]) for joint in np.flatnonzero(off))
+        names = ", ".join(repr(name) for name, is_off in zip(self._joints, off, strict=True) if is_off)
         return (
             f"{self._name}: the robot says that its motor of joint {names} is off (mode 0); it was on. Look "
             "for a motor that is hot, a loose cable, and another program that switched it off"

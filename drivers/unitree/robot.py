@@ -15,7 +15,7 @@ from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.command_sender import PASSIVE_COPIES, CommandSender
 from deal_hw.drivers.unitree.drive_modes import DriveModes
 from deal_hw.drivers.unitree.remote import Remote, decode_remote, parse_combination
-from deal_hw.drivers.unitree.takeover import Takeover
+from deal_hw.drivers.unitree.takeover import LISTEN_S, Takeover
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
@@ -120,6 +120,7 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
     subscribed: ClassVar[tuple[str, ...]] = SUBSCRIBED
     types: ClassVar[Mapping[str, str]] = {}
     homes_by_motor: ClassVar[bool] = False
+    listen_s: ClassVar[float] = LISTEN_S
     _has_services: ClassVar[bool] = True
 
     def __init__(
@@ -204,6 +205,9 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
         finally:
             # The passive command that follows is the first one.
             self._in_charge = False
+
+    def _commanded_since(self, since_ns: int) -> str:
+        return self._takeover.commanded_since(since_ns)
 
     def hand_back(self, timeout_s: float) -> None:
         """Return the robot to the mode that ``home`` released, if any; the robot stands up.

@@ -25,6 +25,8 @@ VOCABULARY = (
     "on_use",
     "documentation",
     "physical",
+    "priorities",
+    "load",
     "ranges",
     "rotations",
     "child_process",
