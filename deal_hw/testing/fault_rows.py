@@ -102,6 +102,7 @@ class FaultRow:
         mend: Makes the robot sound again.
         lasts_s: How long until it is mended by itself while the run goes on [s]; None: it stays, and is
             mended before the next run.
+        from_first_command: That time counts from the first command on, if the fault began before.
         cells: The end in each phase.
         at_s: When it begins, after the phase's own begin [s], where it is not :data:`AT_S`.
     """
@@ -109,6 +110,7 @@ class FaultRow:
     begin: Act | None = None
     mend: Act | None = None
     lasts_s: float | None = None
+    from_first_command: bool = False
     cells: Mapping[str, Cell]
     at_s: Mapping[str, float] = field(default_factory=dict)
 
@@ -304,6 +306,7 @@ def usual_rows(table: FaultTable) -> dict[str, FaultRow | Lacks]:
             begin=joint_fault(limp_after_s=0.0, limp_s=1e6),
             mend=sound_joints,
             lasts_s=2.0,
+            from_first_command=True,
             cells=of_joints(LIMP),
         ),
         OUT_OF_RANGE: FaultRow(begin=joint_fault(out_of_range_after_s=0.0), mend=sound_joints, cells=outside),

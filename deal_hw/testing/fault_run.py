@@ -206,10 +206,11 @@ class _Run:
         rig: FaultRig,
         make_behaviour: Callable[[PlannedEnd], Behaviour],
         sink: Sink,
+        watch: Watch,
         fault: str = "",
         phase: str = "",
     ) -> None:
-        self._rig, self._world = rig, rig.world
+        self._rig, self._world, self._watch = rig, rig.world, watch
         self._fault, self._phase, self._sink = fault, phase, sink
         self.found = FaultEvidence()
         self._process, self._robot = rig.process()
@@ -291,7 +292,7 @@ class _Run:
             return
         found.fault_ns, found.phase = self._world.clock.now_ns(), found.phases[-1]
         if row.lasts_s is not None:
-            self._world.at(found.fault_ns + round(row.lasts_s * 1e9), self._mend)
+            self._world.at(found.fault_ns + round(row.lasts_s * 1e9), self._mend_in_time)
         if row.begin is not None:
             row.begin(self._rig)
         if self._fault in (CONTROL_KILLED, BOTH_KILLED):
@@ -299,6 +300,17 @@ class _Run:
             raise Killed
         if self._fault == SUPERVISOR_KILLED:
             self.loop.request_stop("the supervisor died")
+
+    def _mend_in_time(self) -> None:
+        """Make the robot sound when the fault has lasted for its time."""
+        row, now_ns = self._rig.table.all_rows()[self._fault], self._world.clock.now_ns()
+        assert isinstance(row, FaultRow) and row.lasts_s is not None
+        lasts_ns, first_ns = round(row.lasts_s * 1e9), self._watch.first_ns
+        due_ns = (now_ns if first_ns < 0 else first_ns) + lasts_ns
+        if row.from_first_command and not self._over and now_ns < due_ns:
+            self._world.at(due_ns, self._mend_in_time)
+        else:
+            self._mend()
 
     def _mend(self) -> None:
         found, row = self.found, self._rig.table.all_rows()[self._fault]
@@ -320,7 +332,7 @@ def _keep(record: CycleRecord) -> bool:
 def run_sound(rig: FaultRig, sink: Sink = _keep) -> FaultEvidence:
     """Run the motion without a fault."""
     watch = Watch(rig)
-    found = _Run(rig, rig.make_behaviour, sink).run()
+    found = _Run(rig, rig.make_behaviour, sink, watch).run()
     found.first_ns, found.last_ns = watch.first_ns, watch.last_ns
     return found
 
@@ -335,7 +347,7 @@ def run_fault(rig: FaultRig, fault: str, phase: str, sink: Sink = _keep) -> Faul
         sink: Takes the records of the run.
     """
     world, watch = rig.world, Watch(rig)
-    one = _Run(rig, rig.make_behaviour, sink, fault, phase)
+    one = _Run(rig, rig.make_behaviour, sink, watch, fault, phase)
     found = one.run()
     row = rig.table.all_rows()[fault]
     assert isinstance(row, FaultRow)
@@ -359,7 +371,7 @@ def _run_next(rig: FaultRig, watch: Watch, found: FaultEvidence) -> None:
     world = rig.world
     held = watch.following
     watch.forget()
-    following = _Run(rig, rig.make_next, _keep)
+    following = _Run(rig, rig.make_next, _keep, watch)
     begun: list[int] = []
 
     def look(now_ns: int) -> None:

@@ -16,7 +16,6 @@ from deal_hw.testing.fault_rows import (
     FOREIGN,
     FROZEN,
     HOMING,
-    LIMP,
     PHASES,
     Expected,
     FaultRig,
@@ -28,10 +27,8 @@ from deal_hw.testing.fault_rows import (
 
 FOREIGN_S: Final = 1.0
 """How long another program commands the robot [s]."""
-HANGING: Final = dict.fromkeys(
-    (FROZEN, LIMP), "limbs that hang free stay near the set-points of a small motion, with torque or without"
-)
-"""Faults that may not show on a stand or a crane, and why."""
+HANGING: Final = {FROZEN: "limbs that hang free stay near the set-points of a small motion"}
+"""What may not show on a stand or a crane, and why."""
 _FOREIGN_HZ: Final = 47.0
 """No multiple of the control rate: in virtual time its commands would always come just before ours."""
 

@@ -325,6 +325,12 @@ def test_exchanged_readings_of_a_pose_that_is_held_are_named() -> None:
     assert found is not None and "is at the set-point of 'b'" in found[1].reason
 
 
+def test_limp_joints_of_a_small_motion_are_not_called_exchanged() -> None:
+    """Each reading is near the other one's set-point, but its own is near, too."""
+    found = play(FollowingWatch(robot()), still(0.2, 0.0), still(0.0, 0.2))
+    assert found is not None and "exchanged" not in found[1].reason
+
+
 def test_joints_of_different_units_are_never_exchanged() -> None:
     """A slide's reading in metres is no hinge's."""
     slide = robot(units=("rad", "m"), limit=1e4)

@@ -49,6 +49,9 @@ STUCK: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.005, "m": 0.001})
 """A joint that moves by less stands [rad or m]; a reading's noise is 1 to 2 mrad."""
 LEAST_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.2, "m": 0.04})
 """No drive reaches its limit at a smaller error: a model's stiffness is often far above the real one."""
+MOST_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.6, "m": 0.12})
+"""A soft drive that stays so far behind its set-point counts as one at its limit, which is further away: a B2 on
+a stand that is limp hangs 0.8 rad from its set-points, with a quarter of its limit."""
 UNKNOWN_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.5, "m": 0.1})
 """The same of a drive whose effort limit is unknown."""
 MOVED: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.02, "m": 0.004})
@@ -58,6 +61,9 @@ JUMP: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.04, "m": 0.008})
 JUMP_SPEEDS: Final = 1.25
 """A reading that changes by more than this, plus this many times the trip speed, has jumped [rad or m]."""
 ELSEWHERE: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.08, "m": 0.016})
+FAR: Final = 5.0
+"""A reading that is at another joint's set-point is called exchanged where its own is this many times
+``ELSEWHERE`` away: only the cause that is named depends on it."""
 FITS: Final = 0.45
 """A reading that is so far from its own set-point, and at most this share of it from another one, is not the
 joint's own [rad or m]. Both are means over ``MEAN_S`` of the motion around a mean over ``CENTRE_S``: joints
@@ -116,6 +122,7 @@ class FollowingWatch:
         self._limit = np.where(self._limited, limit, 0.0)
         self._most = np.where(self._limited, limit, 1.0)
         self._reach = np.where(self._limited, by_unit(LEAST_REACH), by_unit(UNKNOWN_REACH))
+        self._softest = by_unit(MOST_REACH)
         self._stands = by_unit(STUCK)
         self._moved, self._faster = by_unit(MOVED), by_unit(FASTER)
         self._jump, self._elsewhere = by_unit(JUMP), by_unit(ELSEWHERE)
@@ -185,7 +192,7 @@ class FollowingWatch:
     def _share(self, position: FloatArray, command: JointCommand) -> FloatArray:
         """Return the drives' pushes as shares of their limits, with sign, (A,)."""
         stiffness = command.stiffness
-        most = np.maximum(self._limit, stiffness * self._reach)
+        most = np.maximum(np.minimum(self._limit, stiffness * self._softest), stiffness * self._reach)
         push = stiffness * (self._setpoint - position) + command.effort
         share = np.divide(push, most, out=np.zeros(len(most)), where=most > 0)
         # A command may allow less than the drive's limit.
@@ -234,7 +241,9 @@ class FollowingWatch:
 
     def _cause(self, joint: int, position: FloatArray) -> str:
         """Return what may be the cause of a push without motion, and what to do."""
-        there = np.abs(position[:, None] - self._setpoint) < self._elsewhere
+        off = np.abs(position[:, None] - self._setpoint)
+        # Of a small motion readings are near many set-points.
+        there = (off < self._elsewhere) & (np.diag(off) > FAR * self._elsewhere)[:, None]
         for other in np.flatnonzero(there[joint] & there[:, joint] & self._like[joint]):
             return (
                 f"Its reading is at the set-point of {self._names[other]!r}, and that one's at its own: the "
