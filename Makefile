@@ -15,7 +15,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.setup-done
 SOURCES := deal_hw calib drivers policies
-SAFETY_FILES := deal_hw/control/safety/*.py,deal_hw/control/process/supervisor.py,deal_hw/control/process/watchdog.py,deal_hw/control/process/claim.py,deal_hw/signals.py
+SAFETY_FILES := deal_hw/control/safety/*.py,deal_hw/control/process/supervisor.py,deal_hw/control/process/watchdog.py,deal_hw/control/process/claim.py,deal_hw/control/process/run_end.py,deal_hw/signals.py
 SAFETY_COVERAGE := --rcfile=/dev/null --data-file=build/safety.coverage
 
 .DEFAULT_GOAL := help

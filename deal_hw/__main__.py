@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from deal_hw.cli.main import main
+from deal_hw.cli.start import main
 
 if __name__ == "__main__":
     sys.exit(main())

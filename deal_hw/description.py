@@ -212,6 +212,18 @@ class RobotDescription:
                     f"robot {self.name!r}: {name} has {len(getattr(self, name))} entries, expected {length}"
                 )
 
+    def require_actuators(self) -> None:
+        """Check that there is something to command.
+
+        Raises:
+            ConfigurationError: No joint has an actuator.
+        """
+        if not self.actuated:
+            raise ConfigurationError(
+                f"no joint of {self.name!r} has an actuator, so nothing can be commanded: its recordings can "
+                "be imported, calibrated and inspected. To move it, give its MJCF actuators"
+            )
+
     @property
     def actuated_index(self) -> tuple[int, ...]:
         """Index of each actuated joint among the joints, (A,)."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import reprlib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from deal_hw.install import install_line
 
@@ -166,6 +167,19 @@ class TrainingDivergedError(TrainingError):
 
 class CalibrationError(DealHwError):
     """The calibration cannot be done."""
+
+
+class ModelNotWrittenError(ConfigurationError):
+    """A calibrated value cannot be written into the user's model; all other files of the result are there.
+
+    Args:
+        message: Why.
+        files: These files by name.
+    """
+
+    def __init__(self, message: str, files: Mapping[str, Path]) -> None:
+        super().__init__(message)
+        self.files = dict(files)
 
 
 class InsufficientDataError(CalibrationError):

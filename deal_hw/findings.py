@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
-from dataclasses import dataclass
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import ParamSpec, TypeVar
+
+from deal_hw.errors import short
+
+Arguments = ParamSpec("Arguments")
+Found = TypeVar("Found")
+Otherwise = TypeVar("Otherwise")
 
 
 class Severity(str, enum.Enum):
@@ -74,6 +82,52 @@ class Finding:
     def __str__(self) -> str:
         """Return all its parts in one line."""
         return self.message
+
+
+@dataclass(frozen=True, slots=True)
+class SafeChecks:
+    """Runs checks of a result that is there already: one that fails is named, and the result stands.
+
+    Attributes:
+        failed: Why checks failed, by their names.
+    """
+
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def run(
+        self,
+        name: str,
+        otherwise: Otherwise,
+        check: Callable[Arguments, Found],
+        *arguments: Arguments.args,
+        **named: Arguments.kwargs,
+    ) -> Found | Otherwise:
+        """Return what a check of these arguments returns; where it raises, note why, return ``otherwise``."""
+        try:
+            return check(*arguments, **named)
+        except Exception as err:
+            self.failed[name] = reason_of(err)
+            return otherwise
+
+    @property
+    def alarms(self) -> tuple[Finding, ...]:
+        """An alarm for each failed check."""
+        return tuple(
+            Finding.alarm(
+                f"The check of {name} failed: {why}.",
+                "It says nothing of this result, neither good nor bad.",
+                "Use the result without it, and report this line.",
+            )
+            for name, why in self.failed.items()
+        )
+
+
+def reason_of(err: Exception) -> str:
+    """Return an error as text: its kind, its message, and where it came from."""
+    frames = traceback.extract_tb(err.__traceback__)
+    at = f" ({frames[-1].filename.rpartition('/')[2]}, line {frames[-1].lineno})" if frames else ""
+    said = short(err).rstrip(".")
+    return f"{type(err).__name__}{said and f': {said}'}{at}"
 
 
 def worst(findings: Sequence[Finding]) -> Severity:

@@ -17,8 +17,9 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from deal_hw.errors import ConfigurationError, UnknownNameError, shown
+from deal_hw.physical import check_amount
 from deal_hw.reading import numbers
-from deal_hw.schema import FINITE, OPEN, from_values
+from deal_hw.schema import FINITE, OPEN_FINITE, from_values
 from deal_hw.types import FloatArray
 
 Scale = Literal["log", "linear"]
@@ -26,8 +27,10 @@ FORMAT = "deal_hw.parameter_distribution/1"
 """Format name of a distribution's JSON."""
 LONGEST_LATENCY_S = 1.0
 """Longest total latency [s]."""
-_LARGEST_VARIANCE = 1e100
-"""Above this variance, sums of squares overflow."""
+_ROUNDING = 1e-6
+"""Share of a range by which a value may lie outside of it."""
+_LARGEST_STD = 1e12
+"""Largest standard deviation, in a parameter's own scale; on either scale it says nothing of the value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,6 +164,8 @@ class Parameter:
                 f"parameter {self.name!r}: a log scale needs a positive range, "
                 f"got low={self.low:g} {self.unit}"
             )
+        check_amount(f"parameter {self.name!r}: low, an end of its range,", self.low, self.unit)
+        check_amount(f"parameter {self.name!r}: high, an end of its range,", self.high, self.unit)
         if not self.low <= self.nominal <= self.high:
             raise ConfigurationError(
                 f"parameter {self.name!r}: the nominal value {self.nominal:g} lies outside "
@@ -176,9 +181,10 @@ class Parameter:
             )
         if self.prior_mean is None or self.prior_std is None:
             return
-        if not (np.isfinite(self.prior_std) and self.prior_std > 0):
+        if not 0 < self.prior_std <= _LARGEST_STD:
             raise ConfigurationError(
-                f"parameter {self.name!r}: prior std is {self.prior_std:g}; it must be above 0"
+                f"parameter {self.name!r}: prior std is {self.prior_std:g}; it must be above 0, at most "
+                f"{_LARGEST_STD:g}"
             )
         if not self.low <= self.prior_mean <= self.high:
             raise ConfigurationError(
@@ -360,6 +366,38 @@ class ParameterSpace:
             for p in self.parameters
         )
 
+    def check_names(self, what: str, names: Iterable[str]) -> None:
+        """Check that the names in a file are those of the free parameters.
+
+        Raises:
+            ConfigurationError: One is missing.
+            UnknownNameError: One is no free parameter; the message lists those.
+        """
+        given = set(names)
+        for name in self.names:
+            if name not in given:
+                raise ConfigurationError(f"field {what}.{name} is missing")
+        for name in sorted(given.difference(self.names)):
+            raise UnknownNameError(f"parameter of {what}", name, self.names)
+
+    def check_value(self, what: str, name: str, value: float) -> None:
+        """Check that a value in a file is one that a search or a training can have had.
+
+        Args:
+            what: The field, for the message.
+            name: The parameter.
+            value: Its value.
+
+        Raises:
+            ConfigurationError: It lies outside the parameter's range.
+        """
+        p = self[name]
+        slack = _ROUNDING * (p.high - p.low)
+        if not (p.low - slack <= value <= p.high + slack) or (p.scale == "log" and value <= 0):
+            raise ConfigurationError(
+                f"field {what} is {value:g} {p.unit}; allowed: {p.low:g} to {p.high:g}, the range of {name!r}"
+            )
+
     def to_json(self) -> list[dict[str, Any]]:
         """Return plain JSON values."""
         return [p.to_json() for p in self.parameters]
@@ -475,25 +513,20 @@ class ParameterDistribution:
             raise ConfigurationError(f"not a parameter distribution: format is {given}, not {FORMAT!r}")
         found = from_values(_DistributionFile, values)
         space = ParameterSpace(found.space)
-        K = len(space)
         low_s, high_s = found.latency_s
         if not 0 <= low_s <= high_s <= LONGEST_LATENCY_S:
             raise ConfigurationError(
                 f"latency_s is {low_s:g} to {high_s:g} s; allowed are 0 to {LONGEST_LATENCY_S:g} s, the "
                 "lower one first"
             )
-        if missing := [name for name in space.names if name not in found.mean]:
-            raise ConfigurationError(f"field mean.{missing[0]} is missing")
+        space.check_names("mean", found.mean)
         mean = np.array([found.mean[name] for name in space.names])
-        for p, value in zip(space, mean, strict=True):
-            if p.scale == "log" and value <= 0:
-                raise ConfigurationError(
-                    f"mean of {p.name!r} is {value:g}; on a log scale it must be above 0"
-                )
+        for name, value in found.mean.items():
+            space.check_value(f"mean.{name}", name, value)
         return cls(
             space=space,
             mean=mean,
-            covariance=None if found.covariance is None else _covariance(found.covariance, K),
+            covariance=None if found.covariance is None else covariance_of(found.covariance, space),
             # The generator would treat minus zero as below zero.
             latency_s=(low_s + 0.0, high_s + 0.0),
         )
@@ -507,7 +540,7 @@ class ParameterDistribution:
 class _DistributionFile:
     """A distribution as its file has it."""
 
-    __pydantic_config__: ClassVar[Mapping[str, Any]] = {**OPEN, "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN_FINITE
 
     space: tuple[Parameter, ...]
     mean: dict[str, float]
@@ -515,14 +548,33 @@ class _DistributionFile:
     latency_s: tuple[float, float]
 
 
-def _covariance(values: Any, size: int) -> FloatArray:
-    if not size and values == []:
+def covariance_of(values: Any, space: ParameterSpace) -> FloatArray:
+    """Return a covariance of a file, (K, K).
+
+    Raises:
+        ConfigurationError: It is none: the message names the entry.
+    """
+    K = len(space)
+    if not K and values == []:
         # Nothing is uncertain but the latency: an empty matrix is written as an empty list.
         return np.zeros((0, 0))
-    found = numbers(values, "covariance", (size, size))
-    if np.abs(found).max(initial=0.0) > _LARGEST_VARIANCE:
-        raise ConfigurationError(f"covariance contains a value above {_LARGEST_VARIANCE:g}")
-    rounding = 1e-9 * np.abs(np.diag(found)).max(initial=0.0)
-    if not np.allclose(found, found.T, rtol=1e-6, atol=rounding) or (np.diag(found) < 0).any():
-        raise ConfigurationError("covariance is not symmetric, or a variance in it is below 0")
+    found = numbers(values, "covariance", (K, K))
+    if np.abs(found).max(initial=0.0) > _LARGEST_STD**2:
+        raise ConfigurationError(f"covariance contains a value above {_LARGEST_STD**2:g}")
+    diagonal = np.diag(found)
+    rounding = 1e-9 * np.abs(diagonal).max(initial=0.0)
+    if (diagonal < 0).any():
+        name = space.names[int(np.argmin(diagonal))]
+        raise ConfigurationError(f"covariance: the variance of {name!r} is below 0")
+    if not np.allclose(found, found.T, rtol=1e-6, atol=rounding):
+        raise ConfigurationError("covariance is not symmetric")
+    std = np.sqrt(diagonal)
+    beyond = np.abs(found) - (1 + 1e-6) * np.outer(std, std)
+    if (beyond > rounding).any():
+        i, j = np.unravel_index(int(np.argmax(beyond)), (K, K))
+        first, second = space.names[i], space.names[j]
+        raise ConfigurationError(
+            f"covariance: {first!r} and {second!r} have {found[i, j]:g}, more than their standard deviations "
+            f"allow ({std[i] * std[j]:g}): their correlation would be outside -1 to 1"
+        )
     return found

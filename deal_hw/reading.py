@@ -163,6 +163,9 @@ def read_yaml(path: Path, tags: Mapping[str, Callable[[Any], Any]] | None = None
 def parse_yaml(text: str, tags: Mapping[str, Callable[[Any], Any]] | None = None) -> Any:
     """Return the plain values of YAML text; to be called inside :func:`reading`.
 
+    A key that is written twice in one mapping is refused. YAML forbids it, but PyYAML takes the last value
+    without a word, and a limit further up in the file would not hold.
+
     Args:
         text: The text.
         tags: Functions of a YAML node for tags beyond the plain ones, by the tag's full name. All others are
@@ -204,12 +207,36 @@ def _weigh(node: Any, weights: dict[int, float]) -> float:
         if len(value) > YAML_TEXT:
             raise ValueError(f"a text of {len(value)} characters; {YAML_TEXT} are allowed")
     else:
+        _refuse_double_keys(value)
         for entry in value:
             weight += sum(_weigh(n, weights) for n in (entry if isinstance(entry, tuple) else (entry,)))
     if weight > YAML_NODES:
         raise ValueError(f"more than {YAML_NODES} values; aliases count each time")
     weights[id(node)] = weight
     return weight
+
+
+def _refuse_double_keys(entries: list[Any]) -> None:
+    """Raise if a key of a YAML mapping is written twice; keys of a merge (``<<``) may be overridden.
+
+    Args:
+        entries: Pairs of nodes of a mapping; nodes of a list pass.
+
+    Raises:
+        ConfigurationError: The message names the key and both lines.
+    """
+    lines: dict[tuple[str, str], int] = {}
+    for entry in entries:
+        key = entry[0] if isinstance(entry, tuple) else None
+        if key is None or not isinstance(key.value, str):
+            continue
+        line, known = key.start_mark.line + 1, lines.get((key.tag, key.value))
+        if known is not None:
+            where = f"lines {known} and {line}" if known != line else f"line {line}"
+            raise ConfigurationError(
+                f"key {shown(key.value)} is written twice, in {where}; keep one of the two"
+            )
+        lines[key.tag, key.value] = line
 
 
 class _Sipped(io.FileIO):

@@ -38,6 +38,9 @@ class Robot(abc.ABC):
     condition_setting: ClassVar[str] = ""
     """Name of the driver's setting by which the operator confirms the condition."""
 
+    listen_s: ClassVar[float] = 0.0
+    """How long :meth:`require_free` listens for other commanders [s]."""
+
     notice: ClassVar[str] = ""
     """A note to the operator before a run of an unusual device; "": none."""
 
@@ -108,6 +111,18 @@ class Robot(abc.ABC):
         Raises:
             SafetyError: Another program or the robot's own controller has it; the text names it.
         """
+
+    def other_commander(self, listen_s: float) -> str:
+        """Listen for commands of other programs; return a sentence that names them, "" if none came.
+
+        For who takes over from a run of deal-hw on this computer that cannot act: until then that run was the
+        only commander, so :meth:`require_free`, which listens for longer and asks the robot's services, is
+        not needed. Returns "" at once by default: the port itself is exclusive. Never raises.
+
+        Args:
+            listen_s: How long to listen [s].
+        """
+        return ""
 
     def lower(self, timeout_s: float) -> str:
         """Bring the robot to a pose in which it may go limp, before ``passive``.

@@ -31,6 +31,8 @@ FINITE: Final[Mapping[str, Any]] = MappingProxyType({**STRICT, "allow_inf_nan": 
 """As :data:`STRICT`, and all numbers are finite."""
 OPEN: Final[Mapping[str, Any]] = MappingProxyType({"strict": True})
 """As :data:`STRICT`, but unknown fields are ignored."""
+OPEN_FINITE: Final[Mapping[str, Any]] = MappingProxyType({**OPEN, "allow_inf_nan": False})
+"""As :data:`OPEN`, and all numbers are finite."""
 SHOWN: Final = 3
 """Number of wrong fields that a message explains; it counts or names the rest."""
 _MAX_NAMES: Final = 16

@@ -8,12 +8,14 @@ from collections import deque
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from deal_hw.clock import Clock
-from deal_hw.errors import SafetyError, TransportTimeoutError
+from deal_hw.errors import SafetyError, TransportError, TransportTimeoutError
 from deal_hw.robot import Robot
 from deal_hw.transport import Message, TopicTransport
 from deal_hw.types import RobotState
 
 _QUEUE: Final = 4096
+_BEFORE_S: Final = 0.05
+"""What waited in buffers has been read after this time [s]."""
 _ENOUGH: Final = 3
 """Number of new states after the first command that confirm the connection."""
 
@@ -80,6 +82,33 @@ class TopicRobot(Robot, Generic[StreamT]):
     def reopen(self) -> None:
         """Open the transport again where it is lost."""
         self._transport.reopen()
+
+    def other_commander(self, listen_s: float) -> str:
+        """Listen for commands of other programs; return who sends them, "" if nobody does.
+
+        What a dead run sent may still wait in buffers, so it is read before the time begins.
+        """
+        for _ in range(2):
+            with contextlib.suppress(TransportError):
+                self._listen(_BEFORE_S)
+                begin_ns = self._clock.now_ns()
+                self._listen(listen_s)
+                return self._commanded_since(begin_ns)
+            # The connection was lost, as while this program was stopped.
+            with contextlib.suppress(TransportError):
+                self._transport.reopen()
+        # Without a connection nobody is received.
+        return ""
+
+    def _listen(self, seconds: float) -> None:
+        end_ns = self._clock.now_ns() + round(seconds * 1e9)
+        while (left_ns := end_ns - self._clock.now_ns()) > 0:
+            with contextlib.suppress(TransportTimeoutError):
+                self._pump(left_ns * 1e-9)
+
+    @abc.abstractmethod
+    def _commanded_since(self, since_ns: int) -> str:
+        """Return which other programs have commanded since a time [ns], as a sentence; "" for none."""
 
     def read_state(self, timeout_s: float) -> RobotState:
         """Return the next valid and new state; others are counted and dropped."""

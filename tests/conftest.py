@@ -162,3 +162,26 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if hasattr(item.config, "workerinput") and not computing and not in_real_time(item):
         computing = True
         os.nice(NICE)
+
+
+@pytest.fixture
+def checks_may_fail() -> None:
+    """For a test in which a check of a result fails on purpose."""
+
+
+@pytest.fixture(autouse=True)
+def no_check_fails(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Fail a test in which a check of a calibration's result failed: the result stands, and would hide it."""
+    from deal_hw import findings
+
+    failed: list[Exception] = []
+    reason_of = findings.reason_of
+
+    def noted(err: Exception) -> str:
+        failed.append(err)
+        return reason_of(err)
+
+    monkeypatch.setattr(findings, "reason_of", noted)
+    yield
+    if failed and "checks_may_fail" not in request.fixturenames:
+        raise failed[0]

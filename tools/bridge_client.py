@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.process.realtime import FIFO_PRIORITY, priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.drivers.go2.descriptions.driver import DRIVER
 from deal_hw.drivers.go2.messages.low_command import LowCommand, LowCommandEncoder
 from deal_hw.drivers.go2.messages.low_state import decode_low_state
@@ -22,6 +22,7 @@ from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.drivers.unitree.go_messages.low_state import LowStateFrame
 from deal_hw.drivers.unitree.rpc import decode_request
 from deal_hw.errors import TransportError, TransportTimeoutError
+from deal_hw.priorities import FIFO_PRIORITY
 from deal_hw.transport import Message, WireOptions
 
 PERIOD_NS: Final = 2_000_000

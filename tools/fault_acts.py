@@ -25,8 +25,9 @@ from fault_rig import (
     Case,
     Rig,
     headline,
-    process_state,
 )
+
+from deal_hw.control.process.realtime import process_state
 
 
 def signal_run(number: signal.Signals) -> Callable[[Rig], None]:

@@ -422,14 +422,6 @@ class Rig(ABC):
             time.sleep(0.01)
 
 
-def process_state(pid: int) -> str:
-    """Return the state of a process as the kernel has it, such as T for stopped; X: there is none."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return "X"
-
-
 def headline(printed: str) -> str:
     """Return the operator's line on the end of the run."""
     lines = [line.strip() for line in printed.splitlines() if line.strip()]

@@ -37,9 +37,9 @@ from side_process import SideProcess
 from stall_monitor import watch_stalls
 
 from deal_hw.clock import MonotonicClock
-from deal_hw.control.process.realtime import FIFO_PRIORITY
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.errors import DealHwError, TransportError
+from deal_hw.priorities import FIFO_PRIORITY
 from deal_hw.ranges import Checked, Range
 from deal_hw.transport import WireOptions
 from deal_hw.workflows.emulation.topics import free_port

@@ -14,7 +14,6 @@ A fault of a joint that the motion does not move shows nothing, so the faulty jo
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
@@ -65,7 +64,8 @@ def faulty(one: FleetRobot, profile: str, fault: str, seed: int) -> dict[str, An
     at_s = float(rng.uniform(*_AT_S)) + (plan.posture.before_s if plan.stand else 0.0)
     d = made.robot.description
     joint = str(rng.choice(d.actuated))
-    faults = dataclasses.replace(JointFaults(faulty_joint=joint), **{FAULTS[fault]: 0.0})
+    begin: dict[str, Any] = {FAULTS[fault]: 0.0}
+    faults = JointFaults(faulty_joint=joint, **begin)
     first_ns, begun_ns, sent_ns, far = -1, -1, -1, 0.0
 
     def sink(record: CycleRecord) -> bool:
@@ -150,7 +150,7 @@ def main() -> int:
     robots = fleet()
     names = tuple(args.robots.split(",")) if args.robots else tuple(robots)
     key = ("robot", "profile", "fault" if args.faults else "motion", "seed")
-    rows = Rows(__file__, args.out, key)
+    made_rows = Rows(__file__, args.out, key)
     for name in names:
         one = robots[name]
         profiles = args.profiles.split(",") if args.profiles else one.profiles
@@ -162,12 +162,12 @@ def main() -> int:
             todo = [(profile, motion) for profile in profiles for motion in one.motions]
         for profile, what in todo:
             for seed in args.seeds:
-                if rows.done(name, profile, what, seed):
+                if made_rows.done(name, profile, what, seed):
                     continue
                 measure = faulty if args.faults else sound
                 row = dict(zip(key, (name, profile, what, seed), strict=True))
-                rows.add(row | measure(one, profile, what, seed), "")
-    print(fault_table(rows.rows) if args.faults else sound_table(rows.rows))
+                made_rows.add(row | measure(one, profile, what, seed), "")
+    print(fault_table(made_rows.rows) if args.faults else sound_table(made_rows.rows))
     return 0
 
 

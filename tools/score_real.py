@@ -57,7 +57,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.parts import joined
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input, usual_method
-from deal_hw.workflows.calibration.run import calibrate_input
+from deal_hw.workflows.calibration.run import calibrate_or_raise
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 METHODS = ("nominal", "one-page", "mujoco-sysid", "no-laws", "default")
@@ -224,7 +224,7 @@ def fitted(
         )
         return work.space, found.estimate, found.latency_s, {}
     chosen = replace(config, seed=seed, threads=1, heldout_window=robot.window_s, laws=method == "default")
-    result: CalibrationResult = calibrate_input(chosen, work, usual_method(config, work))
+    result: CalibrationResult = calibrate_or_raise(chosen, work, usual_method(config, work))
     facts = {name: result.provenance.get(name) for name in ("laws", "candidates")}
     return (
         result.space,

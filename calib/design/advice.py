@@ -267,6 +267,8 @@ def next_recordings(
         return ()
     if robot.base is not None:
         return _without(open_, "motions are planned for a fixed base only; record it held by its trunk")
+    if not robot.description.actuated:
+        return _without(open_, "nothing drives its joints; record a swing from another pose, or weigh a part")
     try:
         described = _described(robot, result, episodes, threads)
         known = dataclasses.replace(robot, description=described)

@@ -161,7 +161,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     alarm = dataclasses.replace(best.diagnosis, do=best.explanation.taken_as(best.added, names))
     run.say(BEFORE_SEARCH, str(alarm))
     rows = law_candidates(run.tried, found, best.explanation.name, names)
-    outcome = conclude_fit(wide, searched, fit)
+    outcome = conclude_fit(dataclasses.replace(wide, progress=run.progress), searched, fit)
     if others:
         shifts = [best.shift_to(one) for one, *_ in others]
         known, added = hold_alike(best.problem, outcome.known, outcome.latency_s, shifts)

@@ -17,7 +17,7 @@ from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
-from deal_hw.findings import Finding
+from deal_hw.findings import Finding, SafeChecks
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -96,6 +96,7 @@ class CalibrationRun:
         first_steps: Physics steps of the problem before this calibration.
         checks: Physics steps of each check so far, by its name.
         left_out: Why checks were left out, by their names.
+        safely: Runs checks after the fit, and notes those that fail.
         inexact: Names of laws whose exact fit to all recordings left more than noise.
         shared: What was found of errors that commands and measurements share, once it was looked for.
         delays: Fits with random delays of commands so far, beside the fits that they began from.
@@ -112,6 +113,7 @@ class CalibrationRun:
     first_steps: int = 0
     checks: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    safely: SafeChecks = field(default_factory=SafeChecks)
     inexact: set[str] = field(default_factory=set)
     shared: list[SharedErrorCheck] = field(default_factory=list)
     delays: list[tuple[Refined, DelaysAsked]] = field(default_factory=list)
@@ -229,3 +231,23 @@ class CalibrationRun:
         candidate: dict[str, Any] = {"estimate": theta, "latency_s": found.latency_s}
         candidate |= {"values": {"chi2": found.chi2}, "space": self.problem.space}
         self.say(stage, f"{source}chi2 {found.chi2:.3g}", done, total, **candidate)
+
+    def offer_fitted(
+        self, space: ParameterSpace, fit: Refined | OutputErrorFit, chi2: float, known: Uncertainty
+    ) -> None:
+        """Report the fit that the result will have, with its uncertainty, before the checks."""
+        fitted = CalibrationResult(
+            method="last fit",
+            space=space,
+            estimate=fit.theta,
+            interval=known.interval,
+            covariance=known.covariance,
+            verdicts=known.verdicts,
+            null_directions=known.null_directions,
+            latency_s=fit.latency_s,
+            latency_interval_s=known.latency_interval_s,
+            chi2=chi2,
+            alarms=known.alarms,
+            biased=known.biased,
+        )
+        self.say(AFTER_FIT, f"chi2 {chi2:.3g}", fitted=fitted)

@@ -62,9 +62,12 @@ def conclude_fit(
     if whole is not None:
         known = averaged(problem, whole, known)
     known = allowed.widened(known, fit, decided)
+    run.offer_fitted(problem.space, fit, plain.chi2, known)
     with run.check(AFTER_FIT):
         judged = fit if allowed.errors is None else plain
-        known, checked = judge(problem, fit, known, run.settings, run.tried, run.allows, plain=judged)
+        known, checked = judge(
+            problem, fit, known, run.settings, run.tried, run.allows, plain=judged, safely=run.safely
+        )
     if doubt or unexplained(plain):
         # Delays were found because the fit with a constant one is not right.
         known = hold_windows(known, fit.latency_s, allowed.before)

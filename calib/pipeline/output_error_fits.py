@@ -233,6 +233,7 @@ class OutputErrorFits(Fits):
         fit = fit_output_error(problem, theta, latency_s, with_latency, iterations=0, central=True)
         known = uncertainty_at(problem, fit, own_scale=True)
         chi2 = fit.chi2 if left is None else chi2
+        run.offer_fitted(problem.space, fit, chi2, known)
         local = None if run.local is None else with_rows(run.local)
         found: Diagnosed | None = None
         judged = run.problem, local
@@ -241,13 +242,15 @@ class OutputErrorFits(Fits):
                 # A local fit that diverged has seen only a part of the recordings.
                 lost = local is None or local.chi2 >= LOCAL_HOPELESS
                 judged = (problem, with_rows(left)) if lost else (run.problem, local)
-                if judged[1] is not None and checks.unexplained(judged[1]):
+                of, shown = judged
+                if shown is not None and checks.unexplained(shown):
                     allows: Allows = run.allows
                     if run.settings.cross_validation:
                         # The cross-validation has judged laws already.
                         allows = refused(allows, [law.name for law in EXPLANATIONS if run.takes(law)])
-                    found = diagnose(judged[0], judged[1], run.tried, allows)
-            split = self._split_half(run, problem, fit, recipe, known)
+                    found = run.safely.run(checks.CAUSES, None, diagnose, of, shown, run.tried, allows)
+            of_halves = (run, problem, fit, recipe, known)
+            split = run.safely.run(checks.HALVES, checks.FAILED, self._split_half, *of_halves)
         known = checks.widened_by_split_half(known, split, latency_s, problem.latency_range_s)
         if settings.hold_first:
             known = _including(known, first.theta)
@@ -256,7 +259,9 @@ class OutputErrorFits(Fits):
         facts: dict[str, Any] = {}
         if local is not None:
             with run.check(AFTER_FIT):
-                known, facts["physics_step"] = checks.with_step(run.problem, local, known)
+                of_step = (run.problem, local, known)
+                known, step = run.safely.run(checks.PHYSICS_STEP, (known, {}), checks.with_step, *of_step)
+                facts |= {"physics_step": step} if step else {}
         rows = laws.candidates()
         if found is not None and judged[1] is not None:
             known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, found.causes)

@@ -183,7 +183,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
         # A fit that explains the recordings needs no sound critic before it.
         doubtful = searched.provenance.get("critic_diverged") and found.chi2 > EXPLAINED_CHI2
         of_search = searched.alarms[:1] if doubtful else ()
-        return dataclasses.replace(
+        result = dataclasses.replace(
             searched,
             method=self.name,
             space=found.space or searched.space,
@@ -202,6 +202,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             seconds=time.perf_counter() - began + attempts.earlier_seconds,
             provenance=provenance,
         )
+        return result.with_failed(run.safely)
 
 
 @dataclass(frozen=True)

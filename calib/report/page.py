@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -22,7 +23,7 @@ from deal_hw.calib.report.verdict import grouped, make_story, trust
 from deal_hw.calib.validation.recording_zeros import next_zeros
 from deal_hw.calibration import RESULT_FILE, CalibrationResult, percent, std_words
 from deal_hw.data.files import published_together, write_json
-from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.errors import ConfigurationError, DatasetError, ModelNotWrittenError
 from deal_hw.parameters import Parameter, ParameterDistribution
 from deal_hw.sim.engine.model import RobotModel, at_step
 from deal_hw.sim.mjcf.calibrated import require_other, write_calibrated_mjcf
@@ -342,35 +343,55 @@ def write_result(
 
     Raises:
         DatasetError: The folder cannot be written.
-        ConfigurationError: A calibrated value cannot be written into the model; all other files are there.
+        ModelNotWrittenError: A calibrated value cannot be written into the model.
         KeyboardInterrupt: Ctrl-C; nothing was changed, or all files are there.
     """
-    unwritable: ConfigurationError | None = None
+    unwritable = ""
+    names = [RESULT_FILE, DISTRIBUTION, TRACE]
+    with _published(folder) as waiting:
+        judged = _write_numbers(waiting, robot, result)
+        np.savez(waiting / TRACE, **_trace(result))
+        if report is not None:
+            write_report(waiting / REPORT, report)
+            names.append(REPORT)
+        names += write_exports(waiting, robot, result, judged)
+        try:
+            require_other(folder / MODEL, robot.description.mjcf)
+            written = write_model(robot, result, waiting / MODEL)
+            names += [file.name for file in written]
+            names += _write_plain(result, waiting)
+        except ConfigurationError as err:
+            # An error in the model must not cost the numbers.
+            unwritable = str(err).replace(str(waiting), str(folder))
+    files = {name: folder / name for name in names}
+    if unwritable:
+        raise ModelNotWrittenError(unwritable, files)
+    return files
+
+
+def write_numbers(folder: Path, robot: RobotModel, result: CalibrationResult) -> dict[str, Path]:
+    """Write a result's numbers alone, both files or none; otherwise as :func:`write_result`."""
+    with _published(folder) as waiting:
+        _write_numbers(waiting, robot, result)
+    return {name: folder / name for name in (RESULT_FILE, DISTRIBUTION)}
+
+
+@contextlib.contextmanager
+def _published(folder: Path) -> Iterator[Path]:
     try:
         with published_together(folder) as waiting:
-            names = [RESULT_FILE, DISTRIBUTION, TRACE]
-            found = trust(result)
-            judged = {"verdict": found.colour, "verdict_reason": found.sentence}
-            write_json(waiting / RESULT_FILE, result.to_json() | judged)
-            write_json(waiting / DISTRIBUTION, model_distribution(robot, result).to_json() | judged)
-            np.savez(waiting / TRACE, **_trace(result))
-            if report is not None:
-                write_report(waiting / REPORT, report)
-                names.append(REPORT)
-            names += write_exports(waiting, robot, result, judged)
-            try:
-                require_other(folder / MODEL, robot.description.mjcf)
-                written = write_model(robot, result, waiting / MODEL)
-                names += [file.name for file in written]
-                names += _write_plain(result, waiting)
-            except ConfigurationError as err:
-                # An error in the model must not cost the numbers.
-                unwritable = ConfigurationError(str(err).replace(str(waiting), str(folder)))
+            yield waiting
     except OSError as err:
         raise DatasetError(f"{folder} cannot be written: {err.strerror}") from err
-    if unwritable is not None:
-        raise unwritable
-    return {name: folder / name for name in names}
+
+
+def _write_numbers(folder: Path, robot: RobotModel, result: CalibrationResult) -> dict[str, str]:
+    """Write result and distribution, and return the verdict that both carry."""
+    found = trust(result)
+    judged = {"verdict": found.colour, "verdict_reason": found.sentence}
+    write_json(folder / RESULT_FILE, result.to_json() | judged)
+    write_json(folder / DISTRIBUTION, model_distribution(robot, result).to_json() | judged)
+    return judged
 
 
 def model_distribution(robot: RobotModel, result: CalibrationResult) -> ParameterDistribution:

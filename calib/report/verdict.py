@@ -5,6 +5,7 @@ The error on held-out motion decides first.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -50,7 +51,18 @@ class Trust:
 
 
 def trust(result: CalibrationResult) -> Trust:
-    """Return whether a result can be used."""
+    """Return whether a result can be used; of one whose checks were not made no more than is known."""
+    if not result.unchecked:
+        return _judged(result)
+    first, *alarms = result.alarms
+    found = _judged(dataclasses.replace(result, alarms=tuple(alarms)))
+    colour: Colour = "red" if found.colour == "red" else "amber"
+    seen = found.seen if colour == "red" else ""
+    means = f"{found.means} {first.means}" if colour == "red" else first.means
+    return Trust(colour, f"{first.seen} {seen}".strip(), means, first.do)
+
+
+def _judged(result: CalibrationResult) -> Trust:
     nominal, calibrated = (result.heldout_nrmse.get(name) for name in ("nominal", "calibrated"))
     noise = (
         f"Residuals are {math.sqrt(result.chi2):.1f} times the sensor's noise." if result.chi2 >= 0 else ""

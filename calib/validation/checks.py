@@ -32,7 +32,6 @@ from deal_hw.calib.fit.intervals import (
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.fit.unexplained import Unexplained
-from deal_hw.calib.validation.candidates import Diagnosed
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
 from deal_hw.calib.validation.explain import Allows, Tried
@@ -40,7 +39,7 @@ from deal_hw.calib.validation.residual_place import residual_place
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm
 from deal_hw.calibration import LATENCY, Z90, listed
-from deal_hw.findings import Finding
+from deal_hw.findings import Finding, SafeChecks
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -59,7 +58,9 @@ intervals of some halves always miss each other."""
 
 
 HALVES = "two halves of the data"
-"""Name of the split-half check."""
+PHYSICS_STEP = "the physics step"
+CAUSES = "causes of the residual"
+"""Names of checks."""
 
 
 def latency_alarms(
@@ -186,11 +187,13 @@ def judge(
     tried: Sequence[Tried] = (),
     allows: Allows = all_allowed,
     *,
+    safely: SafeChecks,
     plain: Refined | None = None,
 ) -> tuple[Uncertainty, dict[str, Any]]:
     """Run the checks; return the updated uncertainty and facts for the provenance.
 
-    The physics step and the causes of the residual come first, because they say what to do.
+    The physics step and the causes of the residual come first, because they say what to do. A check that
+    raises changes nothing.
 
     Args:
         problem: The problem.
@@ -199,6 +202,7 @@ def judge(
         settings: Which checks to run.
         tried: Laws that the model may lack, which were tried.
         allows: Which of the long ones may run.
+        safely: Runs them, and notes those that fail.
         plain: The fit by least squares whose residual is judged, where the fit allows for random errors.
     """
     plain = plain or refined
@@ -215,14 +219,16 @@ def judge(
             "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
         }
     if settings.physics_step:
-        known, facts["physics_step"] = with_step(problem, refined, known)
-    asked = settings.diagnosis and unexplained(plain)
-    found = diagnose(problem, with_rows(plain), tried, allows) if asked else Diagnosed()
+        known, step = safely.run(PHYSICS_STEP, (known, {}), with_step, problem, refined, known)
+        facts |= {"physics_step": step} if step else {}
+    found = None
+    if settings.diagnosis and unexplained(plain):
+        found = safely.run(CAUSES, None, diagnose, problem, with_rows(plain), tried, allows)
     if settings.split_half:
-        split = check_split_half(problem, refined, known, allows)
+        split = safely.run(HALVES, FAILED, check_split_half, problem, refined, known, allows)
         known = widened_by_split_half(known, split, refined.latency_s, problem.latency_range_s)
         facts["split_half"] = split.to_json()
-    if asked:
+    if found is not None:
         known = with_unsure(problem, refined, known, found.unsure)
         known, facts["diagnosis"] = with_causes(problem, plain, known, found.causes)
         facts["candidates"] = [one.to_json() for one in found.candidates]
@@ -376,6 +382,9 @@ class SplitHalf:
                 "Find what the model lacks (see the other alarms), or fit only motion like that of the task.",
             ),
         )
+
+
+FAILED = SplitHalf(note="the check failed")
 
 
 def check_split_half(

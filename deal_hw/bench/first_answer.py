@@ -29,7 +29,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
-from deal_hw.workflows.calibration.run import calibrate_input
+from deal_hw.workflows.calibration.run import calibrate_or_raise
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 KEY = ("task", "seed")
@@ -333,7 +333,7 @@ def _compared(config: FilesSettings, settings: FirstAnswerSettings) -> Row:
             space = progress.space or work.space
             shown.append(_Shown(progress.stage, *since.passed(), theta, latency_s, space))
 
-    result = calibrate_input(config, work, method, progress=watch)
+    result = calibrate_or_raise(config, work, method, progress=watch)
     shown.append(_Shown("end", *since.passed(), result.estimate, result.latency_s, result.space))
 
     # Whole recordings, as far as they are fitted: its windows must not end where ours were cut.

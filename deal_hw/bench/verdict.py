@@ -38,7 +38,7 @@ from deal_hw.testing.plain_faults import (
 )
 from deal_hw.testing.plain_robots import KINDS, PlainRobot, can_have, make_robot, shared_words, write
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
-from deal_hw.workflows.calibration.run import calibrate_input
+from deal_hw.workflows.calibration.run import calibrate_or_raise
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 KEY = ("task", "fault", "seed")
@@ -118,7 +118,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             if why := outside_range(work.space, robot.truth):
                 return row | {"error": f"ConfigurationError: {why}"}
             ends = _ends_when_named if _shared(fault) else None
-            result = calibrate_input(config, work, usual_method(config, work), progress=ends)
+            result = calibrate_or_raise(config, work, usual_method(config, work), progress=ends)
         except _NamedError as end:
             messages.append(str(end))
             row |= {"colour": "said", "named": names(kind, fault, [], messages), "said": messages}

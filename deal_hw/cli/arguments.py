@@ -10,13 +10,12 @@ import dataclasses
 import difflib
 import inspect
 import itertools
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
-
-import tyro
 
 from deal_hw.errors import ConfigurationError, short
 from deal_hw.ranges import hints_of, once_a_class, option
@@ -148,7 +147,7 @@ def options_of(settings: Any) -> Mapping[str, Option]:
 def is_positional(owner: Any, name: str, hint: Any) -> bool:
     """Return whether a field is an argument without a name: marked so, or not keyword-only."""
     fields: Mapping[str, Any] = getattr(owner, "__dataclass_fields__", {})
-    if tyro.conf.Positional in get_args(hint)[1:]:
+    if _is_marked(hint, "Positional"):
         return True
     return name in fields and not fields[name].kw_only and any(one.kw_only for one in fields.values())
 
@@ -157,10 +156,16 @@ def is_option(hint: Any) -> bool:
     """Return whether the command line has a field: not one that only Python can give."""
     marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
     return (
-        tyro.conf.Suppress not in marks
+        not _is_marked(hint, "Suppress")
         and FROM_PYTHON not in marks
         and not any(get_origin(kind) is Callable for kind in _kinds(hint))
     )
+
+
+def _is_marked(hint: Any, mark: str) -> bool:
+    """Return whether a field has a mark of the parser, which is then loaded; an urgent verb loads it not."""
+    marks = sys.modules.get("tyro.conf")
+    return marks is not None and getattr(marks, mark) in get_args(hint)[1:]
 
 
 def _kinds(hint: Any) -> Iterator[Any]:

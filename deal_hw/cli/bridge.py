@@ -15,7 +15,7 @@ import tyro
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.claim import LocalClaim
-from deal_hw.control.process.realtime import FIFO_PRIORITY, priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.drivers.go2.bridge.bridge import COMMANDS, READABLE, Go2Bridge
 from deal_hw.drivers.go2.bridge.config import BridgeConfig
 from deal_hw.drivers.transports.dds_transport import DdsTransport
@@ -23,6 +23,7 @@ from deal_hw.drivers.transports.zenoh_access import access_settings
 from deal_hw.drivers.transports.zenoh_session import check_security, parse_endpoints
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import UnknownNameError
+from deal_hw.priorities import FIFO_PRIORITY
 from deal_hw.ranges import Checked, Range
 from deal_hw.robots.connect import claim_name
 from deal_hw.signals import reason, taken

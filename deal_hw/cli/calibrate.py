@@ -30,7 +30,8 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.ranges import Range
 from deal_hw.types import FloatArray, Trajectory
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method
-from deal_hw.workflows.calibration.run import CalibrateReport, ResultFolder, calibrate_input, finish
+from deal_hw.workflows.calibration.result_folder import ResultFolder
+from deal_hw.workflows.calibration.run import CalibrateReport, calibrate_input, finish
 from deal_hw.workflows.calibration.settings import (
     RECORDINGS,
     CalibrateSettings,
@@ -234,6 +235,8 @@ def calibrate(config: Calibrate) -> CalibrateReport:
         print_plain(report.result)
         _print_next(report, work.name, results.path.parent)
         print_verdict(report.result)
+    if report.problem is not None:
+        raise report.problem
     return report
 
 

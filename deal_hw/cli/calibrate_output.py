@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from deal_hw.calibration import CalibrationResult, Progress, ProgressCallback
+from deal_hw.calibration import FAILED_CHECKS, CalibrationResult, Progress, ProgressCallback
 from deal_hw.cli.piped import PipedProgress
 from deal_hw.findings import Finding
 from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S
@@ -161,6 +161,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     for number, line in enumerate(next_step(result.advice, name, dataset)):
         # A command must not be wrapped: users copy it.
         console.print(line if number else f"{first}: {line}", soft_wrap=line.startswith(" "))
+    for check, why in result.provenance.get(FAILED_CHECKS, {}).items():
+        console.print(f"check of {check}: failed, {why}")
     for check, why in result.provenance.get("checks_left_out", {}).items():
         console.print(f"check of {check}: {why} (--checks all)")
     step = result.provenance.get("physics_step", {})

@@ -12,7 +12,8 @@ from deal_hw.data.checks.suite import check as check_recording
 from deal_hw.data.recording.reader import read_episode
 from deal_hw.errors import SafetyError, TransportError
 from deal_hw.findings import Severity
-from deal_hw.workflows.causes import LATE, Load, late_advice
+from deal_hw.load import Load
+from deal_hw.workflows.causes import LATE, late_advice
 from deal_hw.workflows.running.report import EpisodeReport, RunReport
 
 ATTEMPTS: Final = 5

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from deal_hw.workflows.emulation.cartpole import emulate_cartpole
-from deal_hw.workflows.emulation.common import signalled
+from deal_hw.workflows.emulation.common import signalled, with_parent
 from deal_hw.workflows.emulation.go2 import emulate_go2
 from deal_hw.workflows.emulation.hung import emulate_hung
 from deal_hw.workflows.emulation.plug_in import emulate_plug_in
@@ -27,6 +27,7 @@ def emulate(config: EmulateSettings) -> int:
 
     The first line on standard output is ``port PATH``.
     """
+    config = with_parent(config)
     announce = partial(print, flush=True)
     with signalled() as (stop, cut):
         if isinstance(config, EmulateGo2Settings):

@@ -81,12 +81,16 @@ def parse(name: str, arguments: Sequence[str]) -> tuple[Any, Callable[[Any], obj
     verb = find(name)
     import importlib
 
-    from deal_hw.cli.parsing import read_settings
-
     module = importlib.import_module(verb.module)
-    settings = read_settings(
-        name, verb, getattr(module, verb.config), arguments, getattr(module, "check_words", None)
-    )
+    config, settings = getattr(module, verb.config), None
+    if verb.urgent:
+        from deal_hw.cli.plain_words import plain_settings
+
+        settings = plain_settings(config, arguments)
+    if settings is None:
+        from deal_hw.cli.parsing import read_settings
+
+        settings = read_settings(name, verb, config, arguments, getattr(module, "check_words", None))
     return settings, getattr(module, verb.function)
 
 
@@ -99,7 +103,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
     """
     try:
         settings, function = parse(name, arguments)
-        if name != "doctor":
+        if name != "doctor" and not find(name).urgent:
             _name_problems()
         result = function(settings)
     except ModuleNotFoundError as err:
@@ -114,7 +118,7 @@ def run(name: str, arguments: Sequence[str]) -> int:
 def _name_problems() -> None:
     """Print a line for each plug-in that is left out, if the verb uses the table of robots.
 
-    ``deal-hw doctor`` shows them among its findings.
+    ``deal-hw doctor`` shows them among its findings. An urgent verb does not load them.
     """
     if "deal_hw.robots" in sys.modules:
         from deal_hw.robots import plug_ins

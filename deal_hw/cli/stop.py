@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 
 from deal_hw.workflows.say import to_stderr
-from deal_hw.workflows.stop import STOP, StopReport, StopSettings, run_stop
+from deal_hw.workflows.stopping.robot import StopReport, run_stop
+from deal_hw.workflows.stopping.settings import STOP, StopSettings
 
 KINDS = STOP
 

@@ -42,6 +42,7 @@ class Verb:
         example: Working arguments, as `deal-hw --help` shows them.
         extra: The extra that installs the verb's packages; "" for the base install.
         common: Settings that --help explains; all where empty. --help-all explains all.
+        urgent: Whether a simple command line is read without the parser, which takes 0.2 s to load.
     """
 
     module: str
@@ -51,6 +52,7 @@ class Verb:
     example: str
     extra: str = ""
     common: tuple[str, ...] = ()
+    urgent: bool = False
 
 
 def _verb(
@@ -63,6 +65,7 @@ def _verb(
     function: str = "",
     config: str = "",
     common: str = "",
+    urgent: bool = False,
 ) -> Verb:
     plain = name.replace("-", "_")
     return Verb(
@@ -73,6 +76,7 @@ def _verb(
         example=example,
         extra=extra,
         common=tuple(common.split()),
+        urgent=urgent,
     )
 
 
@@ -194,6 +198,7 @@ TOOLS: Mapping[str, Verb] = MappingProxyType(
             help="make a robot passive at once, from any terminal, whoever of deal-hw commands it",
             config="KINDS",
             example="stop go2",
+            urgent=True,
         ),
         "doctor": _verb(
             "doctor",

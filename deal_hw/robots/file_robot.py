@@ -11,13 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from deal_hw.data.files import dataset_of
-from deal_hw.description import RobotDescription
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, DealHwError
 from deal_hw.robots.entry import API_VERSION, RobotEntry, WireEntry, load
 
 if TYPE_CHECKING:
+    from deal_hw.description import RobotDescription
     from deal_hw.sim.robots.robot_file import RobotFile
 
 WIRE = "serial"
@@ -26,16 +25,29 @@ ROS2_PORTS: Final = {"dds": "127.0.0.1", "zenoh": "tcp/127.0.0.1:7447"}
 """The wires of a robot of ros2_control, and where its emulator is by default: on this machine only."""
 
 
-def is_robot_file(robot: str) -> bool:
-    """Return whether a verb's robot is written as a file or a folder, and not as a name."""
+def is_robot_file(robot: str, is_known: Callable[[str], bool]) -> bool:
+    """Return whether a verb's robot is written as a file or a folder, and not as a name.
+
+    Args:
+        robot: What is written.
+        is_known: Returns whether a robot of the table has a name. It is asked for a folder alone, since it
+            may have to list all plug-ins, and no robot's name ends as a file's.
+    """
     # An empty path would be the present folder.
-    return bool(robot) and (Path(robot).suffix in (".yaml", ".yml") or Path(robot).is_dir())
+    if not robot or Path(robot).suffix in (".yaml", ".yml"):
+        return bool(robot)
+    return Path(robot).is_dir() and not is_known(robot)
 
 
 def robot_yaml(robot: str) -> Path:
     """Return a robot's robot.yaml: the named file, or the one inside a dataset."""
     path = Path(robot)
-    return dataset_of(path) / "robot" / "robot.yaml" if path.is_dir() else path
+    if not path.is_dir():
+        return path
+    # Imported here: finding a robot's name loads no reader of recordings.
+    from deal_hw.data.files import dataset_of
+
+    return dataset_of(path) / "robot" / "robot.yaml"
 
 
 def machine_of(robot: str) -> str:

@@ -12,20 +12,20 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
-from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, UnknownNameError, short
-from deal_hw.parameters import ParameterSpace
 from deal_hw.robots import built_in
 from deal_hw.robots.entry import API_VERSION, RobotEntry, TransportEntry, WireEntry
 from deal_hw.robots.file_robot import file_entry, is_robot_file, machine_of, no_driver
-from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+    from deal_hw.description import RobotDescription
     from deal_hw.motions.scores.balance import BalanceResult
     from deal_hw.motions.scores.velocity_error import Track
+    from deal_hw.parameters import ParameterSpace
     from deal_hw.policies.tasks import TrainingTask
+    from deal_hw.types import Trajectory
 
 ROBOT_GROUP: Final = "deal_hw.robots"
 TRANSPORT_GROUP: Final = "deal_hw.transports"
@@ -65,6 +65,10 @@ class Registry(Generic[EntryT]):
         self._own: dict[str, EntryT] = {one.name: one for one in own}
         self._points: list[EntryPoint] | None = None
         self._loaded: dict[int, EntryT | str] = {}
+
+    def __contains__(self, name: str) -> bool:
+        """Whether there is an entry of that name; plug-ins are listed only if none of deal-hw's has it."""
+        return name in self._own or name in self.names()
 
     def find(self, name: str) -> EntryT | None:
         """Return an entry; None if there is none of that name. A plug-in is loaded only if it is named.
@@ -184,7 +188,7 @@ def plug_ins() -> tuple[PlugIn, ...]:
 
 def is_known(name: str) -> bool:
     """Return whether a name is that of a robot in the table."""
-    return name in robots().names()
+    return name in robots()
 
 
 def robot_entry(name: str) -> RobotEntry:
@@ -372,7 +376,7 @@ def trained_robots() -> tuple[str, ...]:
 
 def is_file(name: str) -> bool:
     """Return whether a name is the path of a robot.yaml or a dataset, and none of the table."""
-    return not is_known(name) and is_robot_file(name)
+    return is_robot_file(name, is_known)
 
 
 def _machine(name: str) -> str:

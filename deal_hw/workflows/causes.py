@@ -5,10 +5,7 @@ A robot that is emulated has no cable, and a slow real one may have nothing wron
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass
-
-from typing_extensions import Self
+from deal_hw.load import Load
 
 LATE = frozenset(
     {"state_stale", "action_late", "command_stale", "clock_jump", "device_watchdog", "device_disarmed"}
@@ -16,32 +13,6 @@ LATE = frozenset(
 """Flags of the safety module (see `deal_hw.control.safety.safety`) that a busy computer can cause."""
 BY_MOTION = frozenset({"position", "velocity", "tilt", "tumble", "flail", "motor_temperature"})
 """Flags that a gentler motion can avoid."""
-
-
-@dataclass(frozen=True, slots=True)
-class Load:
-    """How busy this computer is.
-
-    Attributes:
-        running: Mean number of threads that ran or waited for a processor in the last minute.
-        processors: Processors that this process may use.
-    """
-
-    running: float
-    processors: int
-
-    @classmethod
-    def now(cls) -> Self:
-        """Return the present load."""
-        return cls(os.getloadavg()[0], len(os.sched_getaffinity(0)))
-
-    @property
-    def high(self) -> bool:
-        """Whether threads had to wait for a processor."""
-        return self.running > self.processors
-
-    def __str__(self) -> str:
-        return f"load {self.running:.1f} on {self.processors} processor{'s' * (self.processors != 1)}"
 
 
 def late_advice(local: bool, load: Load) -> str:

@@ -40,6 +40,30 @@ class InputKind:
         return " " in self.usage and not self.usage.startswith("-")
 
 
+class KindTable(Mapping[str, InputKind]):
+    """Kinds by name that are made when they are asked for: to list all robots loads all plug-ins.
+
+    Args:
+        names: Returns all names, in the order of the help.
+        make: Returns the kind of a name; None if there is none.
+    """
+
+    def __init__(self, names: Callable[[], Iterable[str]], make: Callable[[str], InputKind | None]) -> None:
+        self._names, self._make = names, make
+
+    def __getitem__(self, name: str) -> InputKind:
+        found = self._make(name)
+        if found is None:
+            raise KeyError(name)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names())
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self._names())
+
+
 @dataclass(frozen=True, slots=True)
 class Arguments:
     """What was given to a verb, before its kind and so its settings are known.

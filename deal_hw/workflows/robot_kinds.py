@@ -7,10 +7,17 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from deal_hw.errors import DealHwError
-from deal_hw.robots import driven_robots, driver_description, has_hardware, robot_entry
+from deal_hw.robots import (
+    driven_entry,
+    driven_robots,
+    driver_description,
+    has_hardware,
+    is_file,
+    robot_entry,
+    robots,
+)
 from deal_hw.robots.file_robot import robot_yaml
-from deal_hw.workflows.kinds import Arguments, InputKind, Kinds
-from deal_hw.workflows.robot import is_user_robot
+from deal_hw.workflows.kinds import Arguments, InputKind, Kinds, KindTable
 
 FILE = "robot.yaml"
 """The kind of a robot.yaml, and of a dataset that carries its robot."""
@@ -45,19 +52,28 @@ def robot_kinds(
         example: Options in the example of a robot; ``{port}`` becomes a port of its usual wire.
         simulated_example: Options in the example of a simulation.
     """
+    others: dict[str, InputKind] = {} if nothing is None else {"": InputKind(nothing, example="")}
+    others[FILE] = InputKind(plain, example=f"{FILE} {example.format(port=PORTS['serial'])}")
+    if simulated is not None:
+        usage, shown = f"{FILE} --simulated", f"{FILE} {simulated_example}"
+        others[SIMULATED] = InputKind(simulated, usage=usage, example=shown)
+
+    def names() -> tuple[str, ...]:
+        return (*[""] * ("" in others), *driven_robots(), *(name for name in others if name))
+
+    def make(name: str) -> InputKind | None:
+        if name in others:
+            return others[name]
+        entry = robots().find(name)
+        if entry is None or not entry.driven:
+            return None
+        # The same machine on the floor and on a stand has the same options.
+        settings = own.get(name) or own.get(entry.machine)
+        settings = settings or (plain if plain is legged or not has_legs(name) else legged)
+        return InputKind(settings, example=f"{name} {example.format(port=usual_port(name))}")
 
     def table() -> Mapping[str, InputKind]:
-        found = {} if nothing is None else {"": InputKind(nothing, example="")}
-        for name in driven_robots():
-            # The same machine on the floor and on a stand has the same options.
-            settings = own.get(name) or own.get(robot_entry(name).machine)
-            settings = settings or (legged if has_legs(name) else plain)
-            found[name] = InputKind(settings, example=f"{name} {example.format(port=usual_port(name))}")
-        found[FILE] = InputKind(plain, example=f"{FILE} {example.format(port=PORTS['serial'])}")
-        if simulated is not None:
-            usage, shown = f"{FILE} --simulated", f"{FILE} {simulated_example}"
-            found[SIMULATED] = InputKind(simulated, usage=usage, example=shown)
-        return found
+        return KindTable(names, make)
 
     def find(arguments: Arguments) -> str:
         name = "" if arguments.first is None else str(arguments.first)
@@ -78,7 +94,7 @@ def robot_kind(name: str, options: Mapping[str, Any], simulates: bool) -> str:
         UnknownNameError: There is no such robot.
         ConfigurationError: It has a description, but no driver.
     """
-    if is_user_robot(name):
+    if is_file(name):
         if simulates and ("simulated" in options or "simulation" in options):
             return SIMULATED
         if not robot_yaml(name).is_file() or has_hardware(name):
@@ -88,8 +104,8 @@ def robot_kind(name: str, options: Mapping[str, Any], simulates: bool) -> str:
         # Why it cannot be driven, or what is wrong with the file.
         driver_description(name)
         return FILE
-    if name and name not in driven_robots():
-        driver_description(name)
+    if name:
+        driven_entry(name)
     return name
 
 

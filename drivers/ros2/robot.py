@@ -97,6 +97,7 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
     """
 
     stopped_by = "the robot's emergency stop or its supply"
+    listen_s = LISTEN_S
     look_at: ClassVar[str] = "look at the robot's controller_manager and the network"
     info: Ros2Info | None
 
@@ -257,6 +258,12 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
             raise SafetyError(f"{self.description.name}: {self._graph.no_controller()}")
         if self._controller_state != ACTIVE:
             raise SafetyError(f"{self.description.name}: {self._graph.not_active(self._controller_state)}")
+
+    def _commanded_since(self, since_ns: int) -> str:
+        who = self._graph.foreign()
+        if who or (self._foreign_ns is not None and self._foreign_ns >= since_ns):
+            return f"{self.description.name}: {self._graph.foreign_complaint(who)}"
+        return ""
 
     # The start pose, and commands.
 

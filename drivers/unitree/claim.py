@@ -43,9 +43,11 @@ class WireClaim:
 
     Attributes:
         robot: Its name, as messages begin.
+        listen_s: How long :meth:`acquire` listens for other claims [s].
     """
 
     robot: ClassVar[str] = "go2"
+    listen_s: ClassVar[float] = LISTEN_S
 
     def __init__(
         self, transport: TopicTransport, clock: Clock, holder: str, identity: str | None = None

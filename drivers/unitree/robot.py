@@ -13,13 +13,14 @@ from deal_hw.clock import Clock
 from deal_hw.drivers.topic_robot import TopicRobot
 from deal_hw.drivers.transports import topics
 from deal_hw.drivers.unitree.command_sender import PASSIVE_COPIES, CommandSender
+from deal_hw.drivers.unitree.drive_modes import DriveModes
 from deal_hw.drivers.unitree.remote import Remote, decode_remote, parse_combination
-from deal_hw.drivers.unitree.takeover import Takeover
+from deal_hw.drivers.unitree.takeover import LISTEN_S, Takeover
 from deal_hw.drivers.unitree.tick_stream import TickStream
 from deal_hw.drivers.unitree.wording import Wording
 from deal_hw.errors import SafetyError, TransportTimeoutError, WrongDeviceError
 from deal_hw.transport import Message, TopicTransport
-from deal_hw.types import BodyState, FloatArray, JointCommand, RobotState, Status
+from deal_hw.types import BodyState, FloatArray, IntArray, JointCommand, RobotState, Status
 
 PASSIVE_DELAY_NS: Final = 10_000_000
 """States sensed within this time after the passive command do not confirm it [ns]."""
@@ -56,6 +57,11 @@ class StateFrame(Protocol):
     @property
     def effort(self) -> FloatArray:
         """The motors' estimated efforts, (J,) [N·m]."""
+        ...
+
+    @property
+    def mode(self) -> IntArray:
+        """Each motor's mode; 0: off, (J,)."""
         ...
 
     @property
@@ -114,6 +120,7 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
     subscribed: ClassVar[tuple[str, ...]] = SUBSCRIBED
     types: ClassVar[Mapping[str, str]] = {}
     homes_by_motor: ClassVar[bool] = False
+    listen_s: ClassVar[float] = LISTEN_S
     _has_services: ClassVar[bool] = True
 
     def __init__(
@@ -128,6 +135,7 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
         self._sender = CommandSender(
             transport, clock, self.description, self._wire.append, self._encode, self.wording.name
         )
+        self._drives = DriveModes(self.wording.name, self.description.joint_names)
         self._forget()
 
     def _forget(self) -> None:
@@ -198,6 +206,9 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
             # The passive command that follows is the first one.
             self._in_charge = False
 
+    def _commanded_since(self, since_ns: int) -> str:
+        return self._takeover.commanded_since(since_ns)
+
     def hand_back(self, timeout_s: float) -> None:
         """Return the robot to the mode that ``home`` released, if any; the robot stands up.
 
@@ -232,6 +243,7 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
                 f"{self._name}: {self._operator_stop}; release the buttons and call home() again"
             )
         self._fault = ""
+        self._drives.reset()
         self._sender.damp(self._motion()[0])
         self._await_new_states(timeout_s)
         self._armed, self._passive_ns, self._armed_ns = True, None, self._clock.now_ns()
@@ -274,7 +286,7 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
 
     @property
     def fault(self) -> str:
-        """Text if another program or a bridge took the robot since it was armed; "" if none did."""
+        """Text if a drive went off, or another program or a bridge took the robot, since it was armed."""
         return self._fault
 
     @property
@@ -342,6 +354,8 @@ class UnitreeRobot(TopicRobot[TickStream[F]], Generic[F]):
     def _take_frame(self, frame: F, receive_ns: int) -> None:
         self._frame = frame
         self._notice_frame(frame)
+        if self._armed and not self._fault:
+            self._fault = self._drives.complaint(frame.mode)
         remote = decode_remote(frame.remote)
         if remote is not None and remote.holds(self._stop_mask):
             self._operator_stop = f"{self._stop_text} was pressed on the remote"

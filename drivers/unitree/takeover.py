@@ -135,6 +135,10 @@ class Takeover:
         """Whether another program commanded the motors within the last :data:`LISTEN_S`."""
         return self._foreign > 0 and self._clock.now_ns() - self._foreign_ns < round(LISTEN_S * 1e9)
 
+    def commanded_since(self, since_ns: int) -> str:
+        """Return the text that another program has commanded since a time [ns]; "" if none has."""
+        return self.complaint() if self._foreign_ns >= since_ns else ""
+
     def complaint(self) -> str:
         """Return the text that another program commands the motors, and which one it may be."""
         writers = self._transport.writers(topics.LOW_COMMAND)

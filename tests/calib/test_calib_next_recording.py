@@ -81,7 +81,7 @@ def test_advice_without_onnxruntime_names_the_extra(
 
 def test_advice_survives_the_file(episode: SampledEpisode) -> None:
     """Written and read back, the advice is the same; older files have none."""
-    row = {"parameter": "p", "std": 0.5, "std_after": None, "excitation": "", "sentence": "s"}
+    row = {"parameter": "cart.mass", "std": 0.5, "std_after": None, "excitation": "", "sentence": "s"}
     values = dataclasses.replace(result(k9_space(), "weak"), advice=(row,)).to_json()
     assert CalibrationResult.from_json(values).advice == (row,)
     del values["advice"]

@@ -13,7 +13,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
-from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -39,7 +39,7 @@ def robot(tmp_path: Path) -> RobotModel:
     path = tmp_path / "slider.xml"
     path.write_text(SLIDER, encoding="utf-8")
     rates = sampling(0.01, 0.002, 0.4)
-    return load_model(describe(path, load_mjcf(path), ("rail",), ("rail",), rates), rates.step_s)
+    return load_model(describe(path, compile_mjcf(path), ("rail",), ("rail",), rates), rates.step_s)
 
 
 def steps_of(robot: RobotModel, T: int = 200) -> SampledEpisode:
@@ -146,7 +146,7 @@ def test_a_solver_that_stops_early_is_seen_by_what_jumps(solver: str, smooth: bo
     path = tmp_path / "knee.xml"
     path.write_text(KNEE.format(solver=solver), encoding="utf-8")
     rates, names = sampling(0.01, 0.0025, 0.4), ("knee", "ankle")
-    robot = load_model(describe(path, load_mjcf(path), names, names, rates), rates.step_s)
+    robot = load_model(describe(path, compile_mjcf(path), names, names, rates), rates.step_s)
     T, steps = 200, 4 * 199
     rows = np.ones((steps, 2))
     angle = -1.2 + 0.4 * np.sin(np.arange(steps) * 0.0025 * 3.0)[:, None] * [1.0, -1.0]

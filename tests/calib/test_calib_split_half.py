@@ -15,7 +15,7 @@ from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation import diagnosis, explain
+from deal_hw.calib.validation import checks, diagnosis, explain
 from deal_hw.calib.validation.checks import (
     HALVES,
     SplitHalf,
@@ -29,6 +29,7 @@ from deal_hw.calib.validation.checks import (
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Z90, Budget, Progress
 from deal_hw.drivers.cartpole.description import parameter_space
+from deal_hw.findings import SafeChecks
 
 
 def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refined: Refined) -> None:
@@ -195,7 +196,8 @@ def test_k11_gives_no_value_to_what_its_null_directions_move(profile: str, seed:
     theta = np.array([case.truth.parameters[name] for name in space.names])
     problem = Problem(case.robot, space, [case.fit], threads=1, fixed_latency_s=case.latency_s)
     found = with_rows(refine(problem, theta, case.latency_s, (0.2, 0.4)))
-    known, _ = judge(problem, found, uncertainty_at(problem, found, fixed_latency=True), Validation())
+    known = uncertainty_at(problem, found, fixed_latency=True)
+    known, _ = judge(problem, found, known, Validation(), safely=SafeChecks())
     assert len(known.null_directions) == 2
     # The same is reported before a search begins.
     printed: list[Progress] = []
@@ -247,7 +249,7 @@ def test_checks_take_no_more_steps_than_the_fits(noisy_problem: Problem, noisy_r
     known = uncertainty_at(problem, noisy_refined, fixed_latency=True)
     run.attempts.earlier_steps = 0
     with run.check(AFTER_FIT):
-        kept, facts = judge(problem, noisy_refined, known, run.settings, allows=run.allows)
+        kept, facts = judge(problem, noisy_refined, known, run.settings, allows=run.allows, safely=run.safely)
     assert "left out" in facts["split_half"]["note"] and HALVES in run.left_out
     assert len(kept.verdicts) == K
     thorough = dataclasses.replace(run, settings=Validation(thorough=True))
@@ -270,6 +272,30 @@ def test_causes_come_before_halves(
     wrong = dataclasses.replace(noisy_refined, chi2=5.0)
     known = uncertainty_at(noisy_problem, wrong, fixed_latency=True)
     settings = Validation(physics_step=False)
-    _, facts = judge(noisy_problem, wrong, known, settings, allows=refuse)
+    _, facts = judge(noisy_problem, wrong, known, settings, allows=refuse, safely=SafeChecks())
     assert asked[-1] == HALVES and len(asked) > 1
     assert "diagnosis" in facts and "left out" in facts["split_half"]["note"]
+
+
+def test_a_check_that_raises_is_named_and_changes_nothing(
+    noisy_problem: Problem,
+    noisy_refined: Refined,
+    monkeypatch: pytest.MonkeyPatch,
+    checks_may_fail: None,
+) -> None:
+    """Without causes it is not said that there are none; intervals and values stay those of the fit."""
+
+    def broken(*_: object) -> None:
+        raise FloatingPointError("broken")
+
+    for name in ("with_step", "diagnose", "check_split_half"):
+        monkeypatch.setattr(checks, name, broken)
+    wrong = dataclasses.replace(noisy_refined, chi2=5.0)
+    known, safely = uncertainty_at(noisy_problem, wrong, fixed_latency=True), SafeChecks()
+    found, facts = judge(noisy_problem, wrong, known, Validation(), safely=safely)
+    assert list(safely.failed) == [checks.PHYSICS_STEP, checks.CAUSES, HALVES]
+    assert all(why.startswith("FloatingPointError: broken (test_calib") for why in safely.failed.values())
+    assert not {"physics_step", "diagnosis", "candidates"} & set(facts)
+    assert facts["split_half"] == {"note": "the check failed"}
+    np.testing.assert_array_equal(found.interval, known.interval)
+    assert found.alarms == known.alarms and len(safely.alarms) == 3

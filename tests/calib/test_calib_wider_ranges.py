@@ -23,7 +23,7 @@ from deal_hw.calibration import Budget, Progress
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters import wider, with_usual_range
 from deal_hw.workflows.calibration.intake import calibration_input
-from deal_hw.workflows.calibration.run import BestSoFar
+from deal_hw.workflows.calibration.result_folder import BestSoFar
 from deal_hw.workflows.calibration.settings import FilesSettings
 
 MODEL_DAMPING, TRUE_DAMPING = 0.02, 0.3

@@ -23,7 +23,7 @@ from deal_hw.data.recording.dataset import Dataset
 from deal_hw.drivers.cartpole.description import DESCRIPTION, k9_space
 from deal_hw.drivers.cartpole.plant.truth import nominal_truth
 from deal_hw.motions.excitation.behaviours import RichBehaviour, RichConfig
-from deal_hw.workflows.calibration.run import BestSoFar
+from deal_hw.workflows.calibration.result_folder import BestSoFar
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 
 
@@ -217,7 +217,8 @@ def test_an_interrupt_at_the_end_leaves_whole_results(
     pressed: list[Any] = []
 
     def interrupted(*arguments: Any, **named: Any) -> Any:
-        if not pressed:
+        # While the calibration runs, its best fit moves into so_far.
+        if not pressed and "so_far" not in f"{arguments}":
             pressed.append(True)
             os.kill(os.getpid(), number)
         return real(*arguments, **named)

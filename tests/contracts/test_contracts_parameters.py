@@ -33,10 +33,26 @@ def parameter(name: str, low: float = 0.1, high: float = 10.0, **changes: object
 SPACE = ParameterSpace(
     [
         parameter("mass"),
-        parameter("offset", -1.0, 3.0, scale="linear"),
+        parameter("offset", -1.0, 3.0, scale="linear", unit="m"),
         parameter("weighed", known=True),
     ]
 )
+
+
+@pytest.mark.parametrize(
+    ("unit", "low", "high", "words"),
+    [
+        ("kg", -1.0, 2.0, r"is -1 kg; allowed: 0 to 1e\+06 kg \(a large excavator"),
+        ("kg", 1.0, 1e7, r"is 1e\+07 kg; allowed: up to 1e\+06 kg"),
+        ("rad/s", -2e4, 2.0, r"is -20000 rad/s; allowed: -10000 to 10000 rad/s"),
+        ("N·m·s³/rad³", 0.0, 1e13, r"is 1e\+13 N·m·s³/rad³; allowed: up to 1e\+12"),
+        ("-", -1.0, 1e13, r"is 1e\+13; allowed: up to 1e\+12 \("),
+    ],
+)
+def test_what_no_robot_has_is_no_range(unit: str, low: float, high: float, words: str) -> None:
+    """Of units in the table, of others, and of factors; a mass is never below 0."""
+    with pytest.raises(ConfigurationError, match=words):
+        parameter("a", low, high, unit=unit, scale="linear")
 
 
 def test_cube_by_hand() -> None:
@@ -179,7 +195,7 @@ def damaged(**changes: Any) -> dict[str, Any]:
     ("changes", "field"),
     [
         ({"mean": {"a": float("nan"), "b": 0.0}}, "mean"),
-        ({"mean": {"a": -1.0, "b": 0.0}}, "mean of 'a'"),
+        ({"mean": {"a": -1.0, "b": 0.0}}, "mean.a is -1"),
         ({"mean": {"a": [1.0], "b": 0.0}}, "mean"),
         ({"covariance": [[float("nan"), 0.0], [0.0, 1.0]]}, "covariance"),
         ({"covariance": [[1e300, 0.0], [0.0, 1.0]]}, "covariance"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import signal
@@ -15,12 +16,14 @@ from typing import Any
 
 import pytest
 
+from deal_hw import load
 from deal_hw.clock import VirtualClock
 from deal_hw.control.process import supervisor as module
 from deal_hw.control.process.channel import Beat
-from deal_hw.control.process.realtime import SUPERVISOR_PRIORITY
+from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.supervisor import ChildEnd, Supervisor
 from deal_hw.data.recording.recorder_launch import RecorderOutcome
+from deal_hw.priorities import SUPERVISOR_PRIORITY
 from deal_hw.signals import OPERATOR, SUSPENDED
 
 pytestmark = pytest.mark.real_time
@@ -289,6 +292,68 @@ def test_the_supervisor_beats_and_keeps_descriptors_open(tmp_path: Path) -> None
     }
 
 
+def _noted(note: RunNote) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(os.pread(note.fileno(), 4096, 0))
+    return found
+
+
+def test_other_programs_read_how_the_run_is() -> None:
+    """Whether the robot is passive, as soon as that is known, and until when the supervisor is silent."""
+    noted: list[tuple[bool | None, bool]] = []
+    with RunNote("go2", {}) as note:
+
+        def look(run: Run, beat: Beat) -> None:
+            facts = _noted(note)
+            noted.append((facts["passive"], facts["silent_until_ns"] > beat.stamp_ns))
+
+        run = Run(
+            "beat('running'); time.sleep(0.2); result(passive_confirmed=True, opened=os.path.realpath("
+            f"'/proc/self/fd/{note.fileno()}'))",
+            look,
+            note=note,
+        )
+        end = run.end()
+        assert end.result is not None and "deal-hw-run:go2" in end.result["opened"]
+        assert noted == [(None, True)]
+        assert _noted(note)["passive"] is True
+        assert not run.supervisor.was_away
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_the_note_says_what_the_supervisor_reached(confirmed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the control process is dead: its own attempt counts."""
+    with RunNote("go2", {}) as note:
+        run = Run("beat('running'); os.kill(os.getpid(), 9)", note=note)
+        monkeypatch.setattr(run.supervisor, "_passive", lambda phase, tried: confirmed)
+        assert run.end().passive_confirmed is confirmed
+        assert _noted(note)["passive"] is confirmed
+
+
+def test_a_supervisor_notices_that_it_did_not_run() -> None:
+    """For more than 0.8 s between two looks, to the nanosecond: then others may have taken the robot."""
+
+    class Jumping(VirtualClock):
+        jump_ns = 0
+
+        def now_ns(self) -> int:
+            """Jump once, as for a process that was stopped."""
+            self.advance_ns(self.jump_ns)
+            self.jump_ns = 0
+            return super().now_ns()
+
+    for jump_ns, away in ((800_000_000, False), (800_000_001, True)):
+        clock = Jumping()
+
+        def stop(run: Run, beat: Beat, clock: Jumping = clock, jump_ns: int = jump_ns) -> None:
+            clock.jump_ns = jump_ns if beat.phase == "running" else 0
+
+        do = "beat('homing'); channel.recv(1); beat('running'); channel.recv(1); "
+        do += "result(passive_confirmed=True)"
+        run = Run(do, stop, clock=clock)
+        assert run.end().passive_confirmed
+        assert run.supervisor.was_away is away
+
+
 def test_the_process_has_a_group_of_its_own_and_ordinary_priority() -> None:
     """Ctrl-C in the terminal reaches the supervisor alone; the supervisor's priority is not inherited."""
     run = Run(
@@ -355,8 +420,9 @@ def test_the_supervisor_wakes_up_as_soon_as_a_sign_of_life_is_overdue(
     assert waits[-2:] == pytest.approx([0.021, 0.001], rel=1e-9)
 
 
-def test_a_process_that_never_beats_has_thirty_seconds() -> None:
-    """To the nanosecond: it is let live at 30 s, and killed 1 ns later."""
+def test_a_process_that_never_beats_has_thirty_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the nanosecond: it is let live at 30 s, and killed 1 ns later. The message says why."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 0.0)
 
     class Late(VirtualClock):
         asked = 0
@@ -368,8 +434,41 @@ def test_a_process_that_never_beats_has_thirty_seconds() -> None:
 
     clock = Late()
     end = Run("time.sleep(30); sys.exit(7)", clock=clock).end()
-    assert (end.killed, end.exit_code) == ("it sent no heartbeat while starting", -9)
+    assert end.killed.startswith(
+        "it sent no heartbeat while starting in its time, 30 s of its own and 0 s in which"
+    )
+    assert end.exit_code == -9
     assert clock.asked > 30
+
+
+@pytest.mark.parametrize("phase", ["starting", "loading"])
+def test_a_busy_computer_gives_a_process_more_time_to_start(
+    phase: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It waited for a processor for 40 s. Once it commands, this does not count."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 40.0 if begun else 0.0)
+    begun: list[bool] = []
+
+    class Late(VirtualClock):
+        jumped = False
+
+        def now_ns(self) -> int:
+            """Jump by 60 s, once the process is there."""
+            if begun and not self.jumped:
+                self.jumped = True
+                self.advance_ns(60 * 10**9)
+            return super().now_ns()
+
+    monkeypatch.setattr(Supervisor, "_notice_absence", lambda supervisor: begun.append(True))
+    do = "channel.recv(1)" if phase == "starting" else "beat('loading', 0.0); channel.recv(1)"
+    end = Run(f"{do}; time.sleep(0.2); result(passive_confirmed=True)", clock=Late()).end()
+    assert (end.killed, end.passive_confirmed) == ("", True)
+
+
+def test_a_process_that_commands_gets_no_more_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though it waited for a processor: a robot may be stiff meanwhile."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 40.0)
+    assert Run("beat('homing', 0.02); time.sleep(600)").end().killed == "it sent no heartbeat while homing"
 
 
 @pytest.fixture

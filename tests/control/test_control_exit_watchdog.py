@@ -241,6 +241,16 @@ def test_many_that_are_refused_all_hear_by_whom() -> None:
                 LocalClaim("a robot").acquire()
 
 
+def test_anyone_can_ask_whether_a_claim_is_held() -> None:
+    """However often; nobody takes the questions from the queue, and a full one is an answer, too."""
+    claim, asker = LocalClaim("an emulator's port"), LocalClaim("an emulator's port")
+    assert not asker.held
+    with claim:
+        assert all(asker.held for _ in range(300)) and claim.held
+        assert not LocalClaim("another port").held
+    assert not asker.held
+
+
 def test_a_child_keeps_the_claim_when_its_parent_is_gone() -> None:
     """It still has to make the robot passive; when it has ended, the kernel gives the name back."""
     claim = LocalClaim("a robot")

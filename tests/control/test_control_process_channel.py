@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from deal_hw.control.process import realtime
 from deal_hw.control.process.channel import Beat, RecordSender, StatusReceiver, StatusSender, socket_pair
-from deal_hw.control.process.realtime import FIFO_PRIORITY, become_realtime, die_with_parent, raise_priority
+from deal_hw.control.process.realtime import become_realtime, die_with_parent, raise_priority
 from deal_hw.data.recording.record import CycleRecord, decode
 from deal_hw.errors import DatasetError
+from deal_hw.priorities import FIFO_PRIORITY
 from deal_hw.transport import Message
 
 pytestmark = pytest.mark.real_time
@@ -162,3 +164,16 @@ def test_every_thread_of_a_killed_process_is_hurried(monkeypatch: pytest.MonkeyP
         process.kill()
     assert not Path(f"/proc/{process.pid}").exists()
     raise_priority(process.pid)
+
+
+def test_what_is_ending_is_hurried_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed process that nobody has waited for yet; one that lives is left alone."""
+    hurried: list[int] = []
+    monkeypatch.setattr(realtime, "raise_priority", hurried.append)
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        realtime.hurry_the_dying()
+        assert not {process.pid, os.getpid()} & {*hurried}
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        realtime.hurry_the_dying()
+        assert process.pid in hurried and os.getpid() not in hurried

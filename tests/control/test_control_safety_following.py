@@ -234,9 +234,9 @@ def test_an_effort_beside_the_set_point_counts() -> None:
 def test_a_stiff_drive_needs_an_error_of_some_size() -> None:
     """With 100 times the stiffness the limit would be reached at 2 mrad; 30 mrad are still too little."""
     stiff = robot(stiffness=100 * STIFFNESS)
-    changes = {"stiffness": 100 * STIFFNESS}
     for error, finds in ((0.029, False), (0.4, True)):
-        found = play(FollowingWatch(stiff), after_start(error, 0.0), still(0.0, 0.0), **changes)
+        target = after_start(error, 0.0)
+        found = play(FollowingWatch(stiff), target, still(0.0, 0.0), stiffness=100 * STIFFNESS)
         assert (found is not None) is finds
 
 

@@ -26,7 +26,11 @@ from deal_hw.data.importing.load import load_tables
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.errors import ConfigurationError, DatasetError, DealHwError
+from deal_hw.policies.importing.unitree_rl_lab import read_deploy_yaml
 from deal_hw.reading import RECORDING_BYTES, YAML_BYTES, parse_yaml, reading
+from deal_hw.sim.parameters.yaml_space import read_space
+from deal_hw.sim.recordings.setups import read_setups
+from deal_hw.sim.robots.robot_file import read_robot_file
 
 TWISTED = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
@@ -201,6 +205,37 @@ def test_honest_aliases_are_read() -> None:
     assert parse_yaml(text) == {"a": {"sign": -1}, "b": {"sign": -1}, "c": {"sign": -1, "x": 2}}
     with pytest.raises(ConfigurationError, match="characters of YAML"):
         parse_yaml(" " * (YAML_BYTES + 1))
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "robot.yaml": read_robot_file,
+    "columns.yaml": read_column_map,
+    "params.yaml": lambda path: read_space(path, None),
+    "setups.yaml": read_setups,
+    "deploy.yaml": read_deploy_yaml,
+}
+"""Every reader of YAML, by the name of its file."""
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_key_that_is_written_twice_is_refused(tmp_path: Path, name: str) -> None:
+    """PyYAML takes the last value without a word: a limit further up would not hold."""
+    path = tmp_path / name
+    path.write_text("joints:\n- name: hub\n  limit: 1\n  unit: rad\n  limit: 2\n", encoding="utf-8")
+    assert "key 'limit' is written twice, in lines 3 and 5" in refusal(lambda: READERS[name](path), path)
+
+
+@pytest.mark.parametrize("text", ['{a: 1, "a": 2}', "a: {1: x, 1: y}", "x: &x {a: 1}\ny: {<<: *x, <<: *x}"])
+def test_every_spelling_of_a_key_counts(text: str) -> None:
+    """With quotes, as a number, and the merge key itself."""
+    with pytest.raises(ConfigurationError, match=r"is written twice, in line \d; keep one"):
+        parse_yaml(text)
+
+
+def test_a_merge_may_be_overridden() -> None:
+    """Keys of a merged block are no doubles, in whatever order blocks are made."""
+    text = "x: &x {s: 1, t: 1}\na: {q: &y {<<: *x, s: 2}}\nc: {<<: *y, t: 3}"
+    assert parse_yaml(text)["c"] == {"s": 2, "t": 3} and parse_yaml(text)["a"] == {"q": {"s": 2, "t": 1}}
 
 
 @settings(max_examples=150, deadline=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import socket
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deal_hw import load
 from deal_hw.clock import MonotonicClock
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.record import CycleRecord, encode
@@ -163,6 +165,37 @@ def test_a_recorder_that_cannot_start_says_why(tmp_path: Path, make_cycle: MakeC
         handle.wait_ready()
     feed(handle, [encode(make_cycle(number)) for number in range(500)])
     assert not handle.finish().complete
+
+
+def test_a_recorder_that_is_kept_waiting_gets_more_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own time is over at once; what it waits for a processor comes on top."""
+    handle = start_recorder(tmp_path / "a.mcap", DESCRIPTION.to_json(), {})
+    waited = itertools.count(0.0, 100.0)
+    monkeypatch.setattr(load, "waited_s", lambda pid: next(waited))
+    monkeypatch.setattr(load, "_MOST", 1e12)
+    handle.wait_ready(own_s=1e-6)
+    assert handle.finish(own_s=1e-6).complete
+
+
+def test_a_recorder_that_does_not_start_in_its_time_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the load of the computer, what it means and what to do; and one that ended says so."""
+    monkeypatch.setattr(load, "waited_s", lambda pid: 0.0)
+    monkeypatch.setattr(load.Load, "now", classmethod(lambda cls: load.Load(15.2, 2)))
+    handle = start_recorder(tmp_path / "a.mcap", DESCRIPTION.to_json(), {})
+    with pytest.raises(
+        DatasetError,
+        match=r"the recorder process did not start in its time, 1e-06 s of its own .*load 15\.2 on 2 "
+        r"processors: other programs keep this computer busy\. End them",
+    ):
+        handle.wait_ready(own_s=1e-6)
+    handle.process.kill()
+    with pytest.raises(DatasetError, match="ended before it had started"):
+        handle.wait_ready()
+    handle.finish()
 
 
 def test_no_descriptor_leaks(tmp_path: Path) -> None:

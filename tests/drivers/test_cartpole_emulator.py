@@ -1,16 +1,22 @@
 """The emulator over a pty: here with a clock that the test sets, and as a process of its own."""
 
+import contextlib
 import json
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fakes.waiting import PATIENCE_S, until
 
 from deal_hw.cli.emulate import KINDS as EMULATE
 from deal_hw.cli.emulate import emulate
 from deal_hw.clock import MonotonicClock, VirtualClock
+from deal_hw.control.process.realtime import process_state
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.emulator.faults import Hazards
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth, nominal_truth
@@ -279,6 +285,66 @@ def test_a_process_that_loses_its_parent_ends() -> None:
     assert process is not None
     assert process.wait(10) == 0
     emulator.stop()
+
+
+STARTER = """
+import signal, subprocess, sys
+if "nohup" in sys.argv:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+with open(sys.argv[1], "w") as out:
+    command = [sys.executable, "-m", "deal_hw", "emulate", "cartpole", "--nominal", "--duration-s", "600"]
+    print(subprocess.Popen(command, stdout=out).pid, flush=True)
+sys.stdin.read()
+"""
+"""A script that starts an emulator as by hand, with its output in a file, and waits."""
+
+
+@pytest.mark.parametrize("goes_on", [False, True], ids=["usual", "nohup"])
+def test_an_emulator_that_was_started_by_hand_ends_with_its_starter(tmp_path: Path, goes_on: bool) -> None:
+    """A killed script gives no signal. With nohup it goes on, as other programs do."""
+    out = tmp_path / "printed"
+    command = [sys.executable, "-c", STARTER, str(out), *["nohup"] * goes_on]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as starter:
+        assert starter.stdout is not None
+        pid = int(starter.stdout.readline())
+        try:
+            until(lambda: "next, in another terminal" in out.read_text(), "it emulates")
+            starter.kill()
+            starter.wait()
+            if goes_on:
+                robot = make_robot("cartpole", "serial", out.read_text().split()[1], MonotonicClock())
+                drive(robot)
+                robot.disconnect()
+                os.kill(pid, signal.SIGTERM)
+            until(lambda: process_state(pid) in "ZX", "it has ended")
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def test_an_emulator_ends_with_its_terminal() -> None:
+    """A closed window, or a lost ssh connection: the kernel sends SIGHUP."""
+    master, slave = os.openpty()
+    # The first terminal that a new session opens is its own.
+    in_terminal = (
+        "import os, sys\n"
+        "terminal = os.open(sys.argv[1], os.O_RDWR)\n"
+        "for number in range(3):\n"
+        "    os.dup2(terminal, number)\n"
+        "os.execv(sys.executable, [sys.executable, '-m', 'deal_hw', 'emulate', *sys.argv[2:]])\n"
+    )
+    options = ["cartpole", "--nominal", "--duration-s", "600"]
+    command = [sys.executable, "-c", in_terminal, os.ttyname(slave), *options]
+    with subprocess.Popen(command, start_new_session=True) as emulator:
+        with open(master, "rb", buffering=0) as terminal:
+            printed = b""
+            while b"next, in another terminal" not in printed:
+                printed += terminal.read(4096)
+            os.close(slave)
+        try:
+            assert emulator.wait(PATIENCE_S) is not None
+        finally:
+            emulator.kill()
 
 
 def test_a_process_that_cannot_start_says_why() -> None:

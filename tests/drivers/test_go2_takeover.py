@@ -16,9 +16,11 @@ from deal_hw.drivers.unitree.rpc import Request, Response, encode_note, encode_r
 from deal_hw.errors import (
     ProtocolError,
     SafetyError,
+    TransportLostError,
     TransportTimeoutError,
     UnknownNameError,
 )
+from deal_hw.transport import Message
 from deal_hw.types import Status
 
 # Sport mode.
@@ -346,6 +348,46 @@ def test_body_and_remote_reach_the_state() -> None:
     wire.device.remote = None
     body = wire.robot.read_state(0.1).body
     assert body is not None and body.buttons == -1 and not body.sticks.any()
+
+
+def test_who_takes_over_listens_for_a_short_time() -> None:
+    """What the dead run had sent still waits and does not count; a program that goes on commanding does."""
+    wire = FakeBench(mode="")
+    wire.topics.others = {topics.LOW_COMMAND: ("process walk on host pc",)}
+    wire.robot.connect()
+    for i in range(10):
+        wire.topics.say(topics.LOW_COMMAND, STIFF, 0.002 * i)
+    assert wire.robot.other_commander(0.1) == ""
+    for i in range(100):
+        wire.topics.say(topics.LOW_COMMAND, STIFF, 0.05 * i)
+    begin_ns = wire.clock.now_ns()
+    assert "another program commands the robot's motors" in (said := wire.robot.other_commander(0.1))
+    assert "process walk" in said
+    assert wire.clock.now_ns() - begin_ns < 200_000_000
+    assert wire.device.requests == [], "no service of the robot is asked"
+
+
+def test_a_lost_connection_is_made_again_before_others_are_listened_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A stopped program loses it; one that stays lost brings nobody's commands."""
+    wire = FakeBench(mode="")
+    wire.robot.connect()
+    receive, lost = wire.topics.receive, [True]
+
+    def receive_or_lose(timeout_s: float) -> Message:
+        if lost:
+            raise TransportLostError("gone")
+        return receive(timeout_s)
+
+    monkeypatch.setattr(wire.topics, "receive", receive_or_lose)
+    monkeypatch.setattr(wire.topics, "reopen", lost.clear)
+    for i in range(100):
+        wire.topics.say(topics.LOW_COMMAND, STIFF, 0.01 * i)
+    assert "another program" in wire.robot.other_commander(0.1)
+    lost[:] = [True]
+    monkeypatch.setattr(wire.topics, "reopen", lambda: receive_or_lose(0.0))
+    assert wire.robot.other_commander(0.1) == ""
 
 
 @pytest.mark.parametrize(

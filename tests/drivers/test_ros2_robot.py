@@ -293,6 +293,28 @@ def test_before_a_command_others_are_heard(rig: Ros2Rig) -> None:
         rig.robot.require_free(1.0)
 
 
+def test_who_takes_over_listens_for_a_short_time(rig: Ros2Rig) -> None:
+    """Commands of another program, and one that discovery shows."""
+    rig.virtual.discovered = None
+    rig.robot.connect()
+    assert rig.robot.other_commander(0.1) == ""
+    receive, due_ns = rig.virtual.receive, rig.clock.now_ns()
+
+    def receive_and_publish(timeout_s: float) -> Message:
+        nonlocal due_ns
+        if rig.clock.now_ns() >= due_ns:
+            due_ns += 50_000_000
+            rig.virtual.publish(rig.topics.commands, encode_positions(np.zeros(2)))
+        return receive(min(timeout_s, 0.05))
+
+    rig.virtual.receive = receive_and_publish  # type: ignore[method-assign]
+    assert "another program publishes" in rig.robot.other_commander(0.1)
+    rig.virtual.receive = receive  # type: ignore[method-assign]
+    assert rig.robot.other_commander(0.1) == ""
+    rig.know(commands=(TopicEnd(who="process teleop", writes=True),))
+    assert "process teleop" in rig.robot.other_commander(0.1)
+
+
 # Ends.
 
 
@@ -389,6 +411,17 @@ def test_the_emulated_controller_refuses_what_a_real_one_does(rig: Ros2Rig) -> N
     np.testing.assert_allclose(rig.true_position(), 0.0, atol=0.05)
 
 
+def test_the_log_says_whether_the_robot_is_moved_or_held(rig: Ros2Rig) -> None:
+    """By the newest two commands, so that a measurement sees when a run has ended."""
+    rig.armed()
+    for target in (0.1, 0.2, 0.2, 0.2, 0.3):
+        rig.run(1, target)
+    assert make_passive(rig.robot, rig.clock)
+    words = [what for _, _, what in rig.device.changes]
+    assert words[0] == "first command"
+    assert words[-4:] == ["moves", "holds", "moves", "holds"]
+
+
 def test_a_trajectory_is_a_straight_line(tmp_path: Path) -> None:
     """From the present set-point, in the point's time, from the next update on."""
     rig = Ros2Rig(tmp_path, "trajectory")
@@ -460,8 +493,11 @@ class FaultyRun:
             if self._fault == "controller":
                 device.active = False
             else:
-                names = {"limp": "limp_after_s", "held": "held_after_s"}
-                device._joint_faults.give(JointFaults(**{names[self._fault]: 0.0}), device.device_ns)
+                begun = {
+                    "limp": JointFaults(limp_after_s=0.0),
+                    "held": JointFaults(held_after_s=0.0),
+                }
+                device._joint_faults.give(begun[self._fault], device.device_ns)
         return True
 
     def speeds(self, seconds: float) -> FloatArray:

@@ -489,7 +489,8 @@ def test_ctrl_c_on_the_way_to_the_start_pose_lowers_the_arm(tmp_path: Path, bus:
     rig = Rig(tmp_path, bus)
     start = np.array([0.9, -0.7])
     rig.device._batch.set_state(start[None], np.zeros((1, 2)))
-    goals, asked = rig.robot._family.goals, []
+    goals = rig.robot._family.goals
+    asked: list[float] = []
 
     def interrupted(ticks: Any) -> Any:
         if rig.phases[-1:] == [HOMING] and not asked and rig.true_position()[0] < 0.5:
@@ -553,7 +554,8 @@ def test_an_arm_that_cannot_be_lowered_goes_off_all_the_same(tmp_path: Path, bus
 def test_an_adapter_that_returns_our_packets_is_said_and_costs_nothing(tmp_path: Path) -> None:
     """Such as one that joins both directions of a half-duplex line; it is no other program."""
     rig = Rig(tmp_path, "feetech")
-    rig.device.bus.echo = True
+    adapter: Any = rig.device.bus
+    adapter.echo = True
     robot = rig.armed()
     assert robot.info is not None and "returns this computer's own packets" in robot.info.servos
     errors = robot.transport_errors

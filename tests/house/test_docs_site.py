@@ -81,7 +81,7 @@ def test_each_alarm_is_on_its_page(pages: dict[str, str]) -> None:
     assert {path for path, *_ in found} >= {
         "calib/fit/intervals.py",
         "calib/validation/checks.py",
-        "deal_hw/workflows/calibration/run.py",
+        "deal_hw/workflows/calibration/result_folder.py",
     }
     assert all(part.strip("… ") for row in found for part in row)
     page = pages["reference/alarms.md"]

@@ -203,7 +203,11 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path) -> None:
         for package, folder in packages_in_tree().items()
         for path in folder.glob("*.py")
     }
-    assert names - metadata == sources | data_in_tree()
+    scripts = set(project()["tool"]["setuptools"]["script-files"])  # type: ignore[index]
+    assert names - metadata == (sources | data_in_tree()) - scripts
+    assert {Path(name).name for name in metadata if ".data/scripts/" in name} == {
+        Path(script).name for script in scripts
+    }
     assert "deal_hw/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in metadata)
 

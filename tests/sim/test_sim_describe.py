@@ -12,7 +12,7 @@ import pytest
 from deal_hw.errors import ConfigurationError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch
-from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.recordings.episode import SENT, SampledEpisode
@@ -45,7 +45,7 @@ def robot_of(folder: Path, text: str = ARM) -> RobotModel:
     """Return the robot of an MJCF text, recorded at 49.85 Hz."""
     path = folder / "arm.xml"
     path.write_text(text, encoding="utf-8")
-    model = load_mjcf(path)
+    model = compile_mjcf(path)
     rates = sampling(1 / 49.85, float(model.opt.timestep), 0.4)
     return load_model(describe(path, model, ("lift", "rail"), ("lift", "rail"), rates), rates.step_s)
 
@@ -141,7 +141,7 @@ def test_unknown_joint_lists_the_joints(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(ARM, encoding="utf-8")
     with pytest.raises(UnknownNameError, match="lift, rail"):
-        describe(path, load_mjcf(path), ("lift", "knee"), ("lift",), sampling(0.02, 0.002, 0.4))
+        describe(path, compile_mjcf(path), ("lift", "knee"), ("lift",), sampling(0.02, 0.002, 0.4))
 
 
 def test_parts_keep_samples_and_commands_together(tmp_path: Path) -> None:
@@ -197,6 +197,6 @@ def test_an_actuator_that_drives_no_joint_is_named_as_such(tmp_path: Path) -> No
     tendon = '<tendon><fixed name="belt"><joint joint="lift" coef="1"/></fixed></tendon>'
     motor = '<motor name="winch" tendon="belt"/></actuator>'
     path.write_text(ARM.replace("</actuator>", motor).replace("</mujoco>", tendon + "</mujoco>"))
-    model = load_mjcf(path)
+    model = compile_mjcf(path)
     with pytest.raises(ConfigurationError, match=r"that drive no joint: winch \(a tendon\)"):
         describe(path, model, ("lift", "rail"), ("lift", "rail"), sampling(0.02, 0.002, 0.4))

@@ -67,14 +67,15 @@ def written(model: Path) -> Path:
     return path
 
 
-positive = st.floats(1e-9, 1e9)
+positive = st.floats(1e-9, 1e3)
 unlimited = st.none() | positive
+sensed = st.floats(0.0, 6.0)
 
 
 @st.composite
 def joints(draw: st.DrawFn) -> JointEntry:
     """Draw a joint."""
-    low, span = draw(st.floats(-1e6, 1e6)), draw(st.floats(1e-3, 1e6))
+    low, span = draw(st.floats(-1e3, 1e3)), draw(st.floats(1e-3, 1e3))
     ranged = draw(st.booleans())
     actuator = ActuatorEntry(
         stiffness=draw(st.just(0.0) | positive),
@@ -87,8 +88,8 @@ def joints(draw: st.DrawFn) -> JointEntry:
         default_position=low + 0.5 * span,
         position_range=(low, low + span) if ranged else None,
         velocity_limit=draw(unlimited),
-        sensor_noise=draw(st.just(0.0) | positive),
-        sensor_resolution=draw(st.just(0.0) | positive),
+        sensor_noise=draw(sensed),
+        sensor_resolution=draw(sensed),
         actuator=draw(st.none() | st.just(actuator)),
     )
 
@@ -201,7 +202,7 @@ CHANGES: list[tuple[str, str, str]] = [
     ("control_rate_hz: 50.0", "control_rate_hz: 30.0", "allowed: whole multiples of control_rate_hz 30"),
     ("position_range: [-1.5, 1.5]", "position_range: [1.5, -1.5]", "the lower one first, or null"),
     ("default_position: 0.0", "default_position: 1.6", "allowed: -1.5 to 1.5 (position_range)"),
-    ("sensor_noise: 0.0", "sensor_noise: -0.1", "field sensor_noise is -0.1; allowed: 0 or more"),
+    ("sensor_noise: 0.0", "sensor_noise: -0.1", "field sensor_noise is -0.1; allowed: 0 to 6.28319 rad"),
     ("velocity_limit: null", "velocity_limit: 0", "a number above 0, or null for no limit"),
     ("control_rate_hz: 50.0", "control_rate_hz: fast", "field control_rate_hz is 'fast'"),
 ]
@@ -217,6 +218,51 @@ def test_a_contradiction_is_refused(model: Path, old: str, new: str, words: str)
     with pytest.raises(ConfigurationError, match=re.escape(words)) as raised:
         read_robot(path)
     assert str(path) in str(raised.value)
+
+
+NUMBERS = {
+    "control_rate_hz: 50.0": "control_rate_hz: {}",
+    "state_rate_hz: 50.0": "state_rate_hz: {}",
+    "physics_step: 0.002": "physics_step: {}",
+    "default_position: 0.0": "default_position: {}",
+    "position_range: [-1.5, 1.5]": "position_range: [-1.5, {}]",
+    "velocity_limit: null": "velocity_limit: {}",
+    "sensor_noise: 0.0": "sensor_noise: {}",
+    "sensor_resolution: 0.0": "sensor_resolution: {}",
+    "stiffness: 12.0": "stiffness: {}",
+    "damping: 0.1": "damping: {}",
+    "effort_limit: 20.0": "effort_limit: {}",
+}
+"""Each number of a robot.yaml, and how another takes its place."""
+
+
+@pytest.mark.parametrize(
+    "value", ["1e308", "1.0e+308", "-1.0e+308", ".nan", ".inf", "-.inf", "1.0e+11", "text"]
+)
+@pytest.mark.parametrize("old", NUMBERS)
+def test_a_number_that_no_robot_has_is_refused(model: Path, old: str, value: str) -> None:
+    """A velocity limit of 1e308 would be none; each number is refused by its name."""
+    path = written(model)
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, NUMBERS[old].format(value), 1), encoding="utf-8")
+    with pytest.raises(ConfigurationError) as raised:
+        read_robot_file(path)
+    words = str(raised.value)
+    assert str(path) in words and old.partition(":")[0] in words and "\n" not in words
+    assert any(said in words for said in ("allowed: ", "valid number", "finite number"))
+
+
+def test_the_message_says_what_a_joint_can_do(model: Path) -> None:
+    """Given, allowed, and why."""
+    path = written(model)
+    text = path.read_text(encoding="utf-8").replace("velocity_limit: null", "velocity_limit: 1.0e+308", 1)
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(
+        ConfigurationError,
+        match=r"field velocity_limit is 1e\+308 rad/s; allowed: up to 10000 rad/s \(the fastest joints",
+    ):
+        read_robot_file(path)
 
 
 def test_joints_and_actuators_that_are_left_out(model: Path) -> None:

@@ -167,6 +167,17 @@ def test_a_recording_with_parameters_of_its_own_is_a_setup(robot: RobotModel) ->
         ("setups: {a: {recordings: x, payload: {body: b, mass: 0}}}", "leave `payload` out"),
         ("setups: {a: {recordings: x, payload: {body: b, mass: 200 g}}}", "payload's mass"),
         ("setups: {a: {recordings: x, payload: {body: b, at: 0.1}}}", "`at` must be a list of 3 numbers"),
+        (
+            "setups: {a: {recordings: x, payload: {body: b, mass: 1.0e+9}}}",
+            "mass is 1e+09 kg; allowed: up to",
+        ),
+        (
+            "setups: {a: {recordings: x, payload: {body: b, at: [0, 0, 1.0e+300]}}}",
+            "payload's at is 1e+300 m",
+        ),
+        ("setups: {a: {recordings: x, payload: {body: b, radius: 1.0e+300}}}", "radius is 1e+300 m"),
+        ("setups: {a: {recordings: x, stiffness: {'*': 1.0e+300}}}", "stiffness of * is 1e+300 N/m"),
+        ("setups: {a: {recordings: x, encoder_bias: {'*': 1.0e+300}}}", "encoder_bias of * is 1e+300 rad"),
         ("setups: {a: {recordings: x, stiffness: 12}}", "a value for each joint or pattern"),
         ("setups: {'@a': {recordings: x}}", "must not begin with '@'"),
         (

@@ -11,7 +11,7 @@ import pytest
 from deal_hw.calib.report.charts import robot as robot_svg
 from deal_hw.drivers.cartpole.description import DESCRIPTION as CARTPOLE
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION as GO2
-from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.types import FloatArray
@@ -46,7 +46,7 @@ def arm(tmp_path: Path) -> RobotModel:
     """A hinge about y that carries every sort of shape and a slide."""
     path = tmp_path / "arm.xml"
     path.write_text(SHAPES, encoding="utf-8")
-    model = load_mjcf(path)
+    model = compile_mjcf(path)
     names = ("turn", "reach")
     return load_model(describe(path, model, names, names, sampling(0.01, 0.002, 0.4)))
 
@@ -129,7 +129,7 @@ def test_what_diverged_and_what_has_no_shape_is_not_drawn(arm: RobotModel, tmp_p
     bare = re.sub(r'<geom name="(?!floor|post)', r'<geom group="4" mass="1" name="', SHAPES)
     path.write_text(bare, encoding="utf-8")
     names = ("turn", "reach")
-    robot = load_model(describe(path, load_mjcf(path), names, names, sampling(0.01, 0.002, 0.4)))
+    robot = load_model(describe(path, compile_mjcf(path), names, names, sampling(0.01, 0.002, 0.4)))
     assert draw_robot(robot, {"real": np.zeros(2)}, swing(2)) is None
 
 

@@ -10,9 +10,9 @@ import pytest
 from deal_hw.control.loop.timing import LoopTimingReport, Spread
 from deal_hw.control.process.channel import Outcome
 from deal_hw.control.process.supervisor import ChildEnd
+from deal_hw.load import Load
 from deal_hw.robots.connect import on_this_computer, spoilt_on_purpose
-from deal_hw.workflows import causes
-from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
+from deal_hw.workflows.causes import corrupt_advice, late_advice
 from deal_hw.workflows.emulation.common import announced_faults
 from deal_hw.workflows.emulation.settings import EmulateSettings
 from deal_hw.workflows.running.episode import account
@@ -149,7 +149,7 @@ def test_a_run_that_tripped_on_late_states_names_the_load(
     flag: str, reported: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The motion's own limits have nothing to do with it."""
-    monkeypatch.setattr(causes.Load, "now", classmethod(lambda cls: BUSY))
+    monkeypatch.setattr(Load, "now", classmethod(lambda cls: BUSY))
     result = {
         "outcome": "tripped",
         "reason": "the newest state is 76 ms old, at most 50 ms are allowed",

@@ -10,11 +10,20 @@ import pytest
 
 import deal_hw
 from deal_hw.calib.data.noise import HELD_STD, white_noise_std
-from deal_hw.errors import DatasetError
+from deal_hw.calibration import read_result
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.motions.excitation.limits import room
+from deal_hw.sim.robots.user_robot import read_robot
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibrate import Calibration
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings, OwnDatasetSettings
-from deal_hw.workflows.import_export import ImportSettings, import_recordings
+from deal_hw.workflows.import_export import (
+    ExportSettings,
+    ImportSettings,
+    export_recordings,
+    import_recordings,
+)
 
 PENDULUM = """<mujoco>
   <compiler angle="radian"/>
@@ -29,6 +38,9 @@ PENDULUM = """<mujoco>
 </mujoco>"""
 MOTOR = '<actuator><motor name="drive" joint="hub" gear="2"/></actuator>'
 SERVO = '<actuator><position name="drive" joint="hub" kp="5" kv="0.1"/></actuator>'
+
+
+NAMED = '<body name="pole">'
 
 
 def write_model(folder: Path, actuator: str) -> Path:
@@ -87,13 +99,59 @@ def test_a_free_swing_shows_friction_damping_and_inertia(
     assert found.colour == "green"
 
 
-def test_a_model_needs_no_actuator(swing: dict[str, FloatArray], tmp_path: Path) -> None:
-    """Its three parameters are searched."""
+@pytest.mark.parametrize("method", ["local", pytest.param(None, marks=pytest.mark.slow)])
+def test_a_model_needs_no_actuator(swing: dict[str, FloatArray], tmp_path: Path, method: str | None) -> None:
+    """By default and by the local fit alone: the same values, all files, and what they are relative to."""
     printed: list[str] = []
-    settings = FilesSettings(model=write_model(tmp_path, ""), data=[swing], threads=1)
-    inputs = calibration_input(settings, say=printed.append)
-    assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
-    assert any("the model has no actuators" in text for text in printed)
+    model = write_model(tmp_path, "")
+    found = deal_hw.calibrate(model=model, data=[swing], method=method, say=printed.append, threads=1)
+    assert_true(found)
+    assert any("no actuators" in text and "relative to the masses of the model" in text for text in printed)
+    files = found.save(tmp_path / "out")
+    assert {"result.json", "distribution.json", "calibrated.xml", "plain_mujoco.xml"} <= set(files)
+    again = read_result(tmp_path / "out")
+    np.testing.assert_allclose(again.estimate, found.result.estimate)
+
+
+def assert_true(found: Calibration) -> None:
+    """Check that the three values are within 5 % of the truth, and the verdict."""
+    values = {row["parameter"]: row["estimate"] for row in found.rows()}
+    assert values["hub.damping"] == pytest.approx(0.004, rel=0.05)
+    assert values["hub.frictionloss"] == pytest.approx(0.003, rel=0.05)
+    assert values["hub.armature"] == pytest.approx(0.001, rel=0.05)
+    assert values["latency"] == 0.0
+    assert found.colour == "green"
+
+
+@pytest.mark.slow
+def test_of_masses_a_swing_shows_only_ratios(swing: dict[str, FloatArray], tmp_path: Path) -> None:
+    """With a free mass nothing has a value of its own, and the message says why; a known one gives it back.
+
+    Twice all masses, friction, damping and armature move alike, since gravity is the only force from outside.
+    """
+    parameters = tmp_path / "params.yaml"
+    entries = ["{kind: body_mass, elements: pole%s}"] + [
+        f"{{kind: {kind}, elements: hub}}" for kind in ("dof_damping", "dof_frictionloss", "dof_armature")
+    ]
+    model = tmp_path / "pendulum.xml"
+    model.write_text(PENDULUM.format(damping=0.008, friction=0.006, actuator="").replace("<body>", NAMED))
+    results = []
+    for known in ("", ", known: true"):
+        text = "parameters:\n - " + "\n - ".join(entries)
+        parameters.write_text(text % known, encoding="utf-8")
+        results.append(
+            deal_hw.calibrate(
+                model=model, data=[swing], parameters=parameters, method="local", threads=1
+            ).result
+        )
+    free, given = results
+    assert set(free.verdicts) == {"not identifiable"}
+    assert any("pole.mass" in text and "up to a common factor" in text for text in free.null_directions)
+    of_free = dict(zip(free.space.names, free.estimate, strict=True))
+    ratio = of_free["pole.mass"] / 0.2
+    assert of_free["hub.damping"] / ratio == pytest.approx(0.004, rel=0.05)
+    assert of_free["hub.frictionloss"] / ratio == pytest.approx(0.003, rel=0.05)
+    assert given.estimate == pytest.approx([0.004, 0.003, 0.001], rel=0.05)
 
 
 @pytest.mark.parametrize("command", [None, 0.0, np.nan])
@@ -124,16 +182,41 @@ def test_servos_without_commands_are_refused(swing: dict[str, FloatArray], tmp_p
         calibration_input(settings)
 
 
-def test_a_free_swing_is_imported(swing: dict[str, FloatArray], tmp_path: Path) -> None:
-    """The dataset holds one command of 0, and is calibrated as the file is."""
+@pytest.mark.parametrize(("actuator", "driven"), [(MOTOR, ("hub",)), ("", ())])
+def test_a_free_swing_is_imported(
+    swing: dict[str, FloatArray], tmp_path: Path, actuator: str, driven: tuple[str, ...]
+) -> None:
+    """The dataset holds one command of 0, or of nothing, and is calibrated as the file is."""
     path = write_csv(tmp_path / "swing.csv", swing)
-    config = ImportSettings(paths=(path,), out=tmp_path / "data", model=write_model(tmp_path, MOTOR))
+    config = ImportSettings(paths=(path,), out=tmp_path / "data", model=write_model(tmp_path, actuator))
     dataset = import_recordings(config)
     assert dataset is not None
     trajectory = dataset.read(0).trajectory
-    assert trajectory.actuated == ("hub",) and not trajectory.position_target.any()
+    assert trajectory.actuated == driven and not trajectory.position_target.any()
     inputs = calibration_input(OwnDatasetSettings(dataset=tmp_path / "data", threads=1))
     assert sorted(p.name for p in inputs.space) == ["hub.armature", "hub.damping", "hub.frictionloss"]
+
+
+def test_nothing_commands_a_robot_without_actuators(swing: dict[str, FloatArray], tmp_path: Path) -> None:
+    """Its recordings are examined, calibrated and inspected; what would move it is refused in one line."""
+    path = write_csv(tmp_path / "swing.csv", swing)
+    folder = tmp_path / "data"
+    import_recordings(ImportSettings(paths=(path,), out=folder, model=write_model(tmp_path, "")))
+    robot = str(folder / "robot" / "robot.yaml")
+    assert deal_hw.check_robot(robot).exit_code == 0
+    assert deal_hw.inspect(folder / "episodes" / "000000.mcap").rows()
+    with pytest.raises(ConfigurationError, match="has an actuator, so nothing can be commanded"):
+        deal_hw.collect(
+            robot,
+            motion="chirp",
+            dataset=tmp_path / "more",
+            simulation=deal_hw.SimulationOptions(simulated=True),
+        )
+    with pytest.raises(ConfigurationError, match="has an actuator, so nothing can be commanded"):
+        room(read_robot(Path(robot)).description())
+    pytest.importorskip("pyarrow")
+    with pytest.raises(DatasetError, match="LeRobot's format has an action; use --format foxglove"):
+        export_recordings(ExportSettings(path=folder, out=tmp_path / "lerobot"))
 
 
 def test_a_joint_that_never_moves_does_not_outweigh_the_others() -> None:

@@ -12,7 +12,8 @@ from typing import Literal
 
 from typing_extensions import Self
 
-from deal_hw.control.process.realtime import TRANSPORT_PRIORITY, priority
+from deal_hw.control.process.realtime import priority
+from deal_hw.priorities import TRANSPORT_PRIORITY
 
 State = Literal["open", "frozen", "refused"]
 _READ = 65536

@@ -36,14 +36,10 @@ class LocalClaim:
     @property
     def held(self) -> bool:
         """Whether a process on this computer holds the name, this one or another."""
-        try:
-            with socket.socket(socket.AF_UNIX) as asking:
-                asking.setblocking(False)
-                asking.connect(self._name)
-        except OSError as error:
-            # A full queue of a holder.
-            return error.errno == errno.EAGAIN
-        return True
+        with socket.socket(socket.AF_UNIX) as asking:
+            asking.setblocking(False)
+            # EAGAIN: the holder's queue is full.
+            return asking.connect_ex(self._name) in (0, errno.EAGAIN)
 
     def fileno(self) -> int:
         """Return the descriptor that a child inherits."""

@@ -13,16 +13,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-_PR_SET_PDEATHSIG = 1
+from deal_hw.child_process import signal_at_end_of_parent
+from deal_hw.priorities import FIFO_PRIORITY
+
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 PARENT_DIED = signal.SIGUSR1
 """Signal that the kernel sends when the parent dies. Another program may send it, too: see
 :func:`parent_is_gone`."""
-FIFO_PRIORITY = 50
-SUPERVISOR_PRIORITY = FIFO_PRIORITY + 1
-"""Above the control process, since it must be able to kill one that blocks a processor."""
-TRANSPORT_PRIORITY = FIFO_PRIORITY - 10
-"""Priority of the supervisor's transport threads, because damping must be sent on a busy machine, too."""
 _MCL_ONFAULT = 4
 _PF_EXITING = 4
 
@@ -108,6 +105,17 @@ def raise_priority(pid: int) -> None:
                 os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
 
 
+def hurry_the_dying() -> None:
+    """Give real-time priority to all processes that are ending, if permitted.
+
+    A killed one keeps its ports and claims until its last thread has run once more. By then the kernel does
+    not show any more which program it was.
+    """
+    for pid in os.listdir("/proc"):
+        if pid.isdigit() and is_ending(int(pid)):
+            raise_priority(int(pid))
+
+
 def _lock_memory() -> str | None:
     """Lock the process's memory; return the reason of a refusal."""
     # With MCL_FUTURE under a finite limit, a later allocation beyond it fails and kills the loop in the
@@ -122,21 +130,9 @@ def _lock_memory() -> str | None:
 def die_with_parent(parent_pid: int) -> None:
     """Have the kernel send ``PARENT_DIED`` when the parent dies, so that the loop ends by its passive route.
 
-    Only the signal's number is reliable: with several threads in the parent, the first one to end sends it,
-    and ``getppid`` still names the parent.
-
-    Args:
-        parent_pid: The parent's process id, as the parent gave it.
-
-    Raises:
-        ProcessLookupError: The parent has already ended.
+    See :func:`deal_hw.child_process.signal_at_end_of_parent`.
     """
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, PARENT_DIED, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    # The parent may have died before the call above; then no signal ever comes.
-    if os.getppid() != parent_pid:
-        raise ProcessLookupError(f"the parent process {parent_pid} has ended")
+    signal_at_end_of_parent(parent_pid, PARENT_DIED)
 
 
 def parent_is_gone(parent_pid: int) -> bool:
@@ -150,12 +146,31 @@ def parent_is_gone(parent_pid: int) -> bool:
     """
     if os.getppid() != parent_pid:
         return True
-    try:
-        words = Path(f"/proc/{parent_pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
+    if not _stat(parent_pid):
         return Path("/proc/self/stat").exists()
+    return is_ending(parent_pid)
+
+
+def is_ending(pid: int) -> bool:
+    """Return whether a process is ending at this moment, or has ended."""
+    words = _stat(pid)
+    if not words:
+        return True
     state, flags, pending = words[0], int(words[6]), int(words[28])
     return state in "ZX" or bool(flags & _PF_EXITING) or bool(pending & 1 << signal.SIGKILL - 1)
+
+
+def process_state(pid: int) -> str:
+    """Return a process's state as the kernel shows it, such as "T" for stopped; "X" where there is none."""
+    return (_stat(pid) or ["X"])[0]
+
+
+def _stat(pid: int) -> list[str]:
+    """Return what the kernel says of a process, from its state on; empty where there is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 class _Event(ctypes.Structure):

@@ -1,7 +1,8 @@
 """What a run says of itself to other programs on this computer: its robot, how that is reached, how it is.
 
 The note is a file in memory, named after the robot. The run's supervisor and control process keep it open, so
-it is gone when both have ended, however they end. Other programs of the same user find it in ``/proc``.
+it is gone when both have ended, however they end. Other programs of the same user find it in ``/proc``. The
+supervisor writes until when it may be silent, so that others see whether it hangs.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class RunNote:
 
     def __init__(self, robot: str, facts: Mapping[str, Any]) -> None:
         self._robot = robot
-        self._facts = {**facts, "robot": robot, "pid": os.getpid(), "passive": True}
+        fixed = {"robot": robot, "pid": os.getpid()}
+        self._facts = {**facts, **fixed, "passive": True, "silent_until_ns": None}
         self._fd = -1
 
     def fileno(self) -> int:
@@ -46,6 +48,18 @@ class RunNote:
             passive: Whether it confirmed that it is; None while it may be commanded.
         """
         self._facts["passive"] = passive
+        self._write()
+
+    def beat(self, silent_until_ns: int) -> None:
+        """Say that the run works.
+
+        Args:
+            silent_until_ns: When the next call comes at the latest, on the machine's monotonic clock [ns].
+        """
+        self._facts["silent_until_ns"] = silent_until_ns
+        self._write()
+
+    def _write(self) -> None:
         text = json.dumps(self._facts).encode()
         # One write at one place, then the rest goes: a reader meets one of the two texts, or tries again.
         os.pwrite(self._fd, text, 0)
@@ -81,6 +95,15 @@ class FoundRun:
         """Whether its robot is passive by now; None while it may be commanded."""
         found: bool | None = (_read(self.fd) or self.facts)["passive"]
         return found
+
+    def hangs(self, now_ns: int) -> bool:
+        """Return whether the run is silent for longer than it may be; False while it promises nothing.
+
+        Args:
+            now_ns: The machine's monotonic clock [ns].
+        """
+        until_ns = (_read(self.fd) or self.facts).get("silent_until_ns")
+        return until_ns is not None and now_ns > until_ns
 
     def holders(self) -> list[int]:
         """Return the processes of the run that live: it, and its control process."""

@@ -156,7 +156,7 @@ class FollowingWatch:
         self._now_ns = now_ns
         # A drive with a set-point generator moves its set-point at most this fast.
         travel = command.speed_limit * passed_s
-        self._setpoint = self._setpoint + np.clip(command.position_target - self._setpoint, -travel, travel)
+        self._setpoint += np.clip(command.position_target - self._setpoint, -travel, travel)
         return (
             self._jumped(position, passed_s)
             or self._pushed(now_ns, position, velocity, command, passed_s)
@@ -165,7 +165,7 @@ class FollowingWatch:
 
     def _begin(self, now_ns: int, position: FloatArray, velocity: FloatArray, command: JointCommand) -> None:
         self._now_ns = now_ns
-        self._setpoint = command.position_target.copy()
+        self._setpoint: FloatArray = command.position_target.copy()
         count = len(position)
         self._load = self._share(position, command)
         self._at = position.copy()

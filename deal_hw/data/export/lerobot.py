@@ -80,6 +80,11 @@ def export_lerobot(
     first = trajectories[0]
     if any((t.joint_names, t.actuated) != (first.joint_names, first.actuated) for t in trajectories):
         raise DatasetError("the recordings have different joints; export those of one robot at a time")
+    if not first.actuated:
+        raise DatasetError(
+            "no joint of the robot has an actuator, and every frame of LeRobot's format has an action; use "
+            "--format foxglove"
+        )
     names = names or [f"recording {number}" for number in range(len(trajectories))]
     tables = [table_of(trajectory, name) for trajectory, name in zip(trajectories, names, strict=True)]
     period = common_period(tables)

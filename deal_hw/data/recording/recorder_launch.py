@@ -16,7 +16,10 @@ from typing import Any
 from deal_hw.child_process import own_process_group
 from deal_hw.clock import Clock, MonotonicClock
 from deal_hw.errors import DatasetError
+from deal_hw.load import TimeLimit
 from deal_hw.signals import held_back
+
+_POLL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,19 +61,24 @@ class RecorderHandle:
         self._ready = False
         self._finished: dict[str, Any] | None = None
 
-    def wait_ready(self, timeout_s: float = 10.0) -> None:
+    def wait_ready(self, own_s: float = 10.0) -> None:
         """Wait until the episode is open.
+
+        Args:
+            own_s: The time that the process may take, without that in which it waits for a processor [s].
 
         Raises:
             DatasetError: The file cannot be written, or the process did not come up in time.
         """
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while not self._ready and not self._errors and not self._ended and self._clock.now_ns() < deadline_ns:
-            self._poll((deadline_ns - self._clock.now_ns()) * 1e-9)
+        limit = TimeLimit(self.process.pid, own_s, self._clock)
+        while not self._ready and not self._errors and not self._ended and (left_s := limit.left_s) > 0:
+            self._poll(min(left_s, _POLL_S))
         if self._errors:
             raise DatasetError(f"the recorder cannot start: {self._errors[0]}")
+        if self._ended and not self._ready:
+            raise DatasetError("the recorder process ended before it had started; check memory and disk")
         if not self._ready:
-            raise DatasetError(f"the recorder process did not start within {timeout_s} s")
+            raise DatasetError(f"the recorder process did not start in its time, {limit}")
 
     def errors(self) -> tuple[str, ...]:
         """Return the errors so far, such as a full disk; polls the status pipe, never waits."""
@@ -81,14 +89,18 @@ class RecorderHandle:
         """Close this process's copy of the control end; idempotent."""
         self.control_socket.close()
 
-    def finish(self, timeout_s: float = 10.0) -> RecorderOutcome:
-        """Close the control end and wait for the file to be closed; a recorder that hangs is killed."""
+    def finish(self, own_s: float = 10.0) -> RecorderOutcome:
+        """Close the control end and wait for the file to be closed; a recorder that hangs is killed.
+
+        Args:
+            own_s: As of :meth:`wait_ready`.
+        """
         self.release()
-        deadline_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        while not self._ended and self._clock.now_ns() < deadline_ns:
-            self._poll((deadline_ns - self._clock.now_ns()) * 1e-9)
+        limit = TimeLimit(self.process.pid, own_s, self._clock)
+        while not self._ended and (left_s := limit.left_s) > 0:
+            self._poll(min(left_s, _POLL_S))
         if not self._ended:
-            self._errors.append(f"the recorder did not end within {timeout_s} s and was killed")
+            self._errors.append(f"the recorder was killed, since it did not end in its time, {limit}")
             self.process.kill()
             self._ended = True
         code = self.process.wait()

@@ -20,8 +20,9 @@ def room(description: RobotDescription) -> FloatArray:
     """Return the largest offset of each actuated joint to either side of the centre, (A,); 0 if it has none.
 
     Raises:
-        ConfigurationError: No joint has room.
+        ConfigurationError: No joint has room, or an actuator.
     """
+    description.require_actuators()
     low, high = np.array(description.limits.target).T
     if description.excitation_range:
         inner = np.array(description.excitation_range).T

@@ -14,7 +14,7 @@ import numpy as np
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
-from deal_hw.sim.engine.compiling import load_mjcf
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.laws.commands import Filters
 from deal_hw.sim.parameters import apply_parameters, present
 from deal_hw.sim.parameters.drive import JointDrive, filtered, find_drive
@@ -121,7 +121,7 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
         ConfigurationError: The MJCF does not compile, or the device period is no multiple of the step.
         UnknownNameError: A joint of the description is not in the model.
     """
-    model = load_mjcf(description.mjcf)
+    model = compile_mjcf(description.mjcf)
     if step_s is None:
         # Two robots may share an MJCF whose step fits only one of them.
         steps = 1.0 / (description.device_rate_hz * model.opt.timestep)
@@ -189,8 +189,9 @@ def filters_of(model: mujoco.MjModel, actuators: Sequence[int], scale: FloatArra
         actuators: The actuators, A of them.
         scale: From :func:`command_scale`.
     """
-    rows = list(actuators)
-    on = np.array([filtered(model, i) for i in rows])
+    # With their types, since a model may have no actuator.
+    rows = np.array(actuators, dtype=np.int64)
+    on = np.array([filtered(model, int(i)) for i in rows], dtype=bool)
     limited = on & np.array(model.actuator_ctrllimited[rows], dtype=bool)
     ends = np.sort(model.actuator_ctrlrange[rows] * scale[:, None], axis=1)
     return Filters(

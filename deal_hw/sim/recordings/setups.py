@@ -21,6 +21,7 @@ from deal_hw.description import RobotDescription
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError, short, shown
 from deal_hw.parameters import Parameter, ParameterSpace
+from deal_hw.physical import check_amount
 from deal_hw.reading import YAML_BYTES, number, parse_yaml, read_bytes, reading
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, actuator_of
@@ -37,6 +38,8 @@ BASE: Final = "model"
 _KEYS: Final = ("recordings", "mjcf", "payload", "stiffness", "damping", "encoder_bias")
 _PAYLOAD_KEYS: Final = ("body", "name", "at", "mass", "range", "radius")
 _GAINS: Final = ("stiffness", "damping")
+_WIDER_UNIT: Final = {"stiffness": "N/m", "damping": "N·s/m", "encoder_bias": "rad"}
+"""Of a hinge's and a slide's unit that with the wider bound: a pattern may name both."""
 _RADIUS_M: Final = 0.02
 _RANGE_KG: Final = (0.001, 5.0)
 
@@ -334,15 +337,20 @@ def _payload(entry: Any) -> Payload:
         raise ConfigurationError("a payload has a known `mass`, or a `range` to search it in; give one")
     low, high = _floats(entry.get("range", list(_RANGE_KG)), 2, "range")
     mass = None if entry.get("mass") is None else number(entry["mass"], "payload's mass")
+    for kg in (high, mass or 0.0):
+        check_amount("payload's mass", kg, "kg")
     if not (0 < low < high and (mass is None or mass > 0)):
         raise ConfigurationError(
             "a payload's mass is above 0 kg, and its range begins with the lower value; for a recording "
             "without payload leave `payload` out"
         )
     radius = number(entry.get("radius", _RADIUS_M), "payload's radius")
+    check_amount("payload's radius", radius, "m")
     if not radius > 0:
         raise ConfigurationError(f"a payload's radius is above 0 m, got {radius:g}")
     x, y, z = _floats(entry.get("at", [0.0, 0.0, 0.0]), 3, "at")
+    for metres in (x, y, z):
+        check_amount("payload's at", metres, "m")
     return Payload(
         body=entry["body"],
         name=str(entry.get("name", "payload")),
@@ -442,6 +450,8 @@ def _gains(value: Any, what: str) -> dict[str, float]:
     found = {str(name): number(gain, f"{what} of {name}") for name, gain in value.items()}
     if any(gain < 0 for gain in found.values()):
         raise ConfigurationError(f"`{what}` has a value below 0: {shown(dict(value))}")
+    for name, gain in found.items():
+        check_amount(f"{what} of {name}", gain, _WIDER_UNIT[what])
     return found
 
 

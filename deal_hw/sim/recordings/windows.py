@@ -274,7 +274,8 @@ def _advance_copies(
     used = np.minimum(np.arange(copies), G - 1)
 
     def by_copy(values: FloatArray) -> FloatArray:
-        return np.moveaxis(values[:, used], 1, 0).reshape(-1, *values.shape[2:])
+        # The count is written out: commands of a robot without actuators have no entries to count by.
+        return np.moveaxis(values[:, used], 1, 0).reshape(copies * N, *values.shape[2:])
 
     batch.set_state(by_copy(state[0]), by_copy(state[1]))
     x, v = batch.advance(by_copy(control), every, force=None if force is None else by_copy(force))

@@ -16,6 +16,7 @@ import yaml
 
 from deal_hw.description import EFFORT_UNITS
 from deal_hw.errors import ConfigurationError
+from deal_hw.physical import SENSOR, check_amount
 from deal_hw.reading import NAMES, read_yaml, reading
 from deal_hw.schema import FINITE, Tagged, from_values, refusal
 from deal_hw.sim.robots.hardware_section import (
@@ -55,6 +56,14 @@ class ActuatorEntry:
         if self.effort_limit is not None and self.effort_limit <= 0:
             raise refusal("effort_limit", self.effort_limit, "a number above 0, or null for no limit")
 
+    def check_amounts(self, unit: str) -> None:
+        """Check its numbers for a joint whose position has this unit; errors name the field."""
+        effort = EFFORT_UNITS[unit]
+        check_amount("field actuator.stiffness", self.stiffness, f"{effort}/{unit}")
+        check_amount("field actuator.damping", self.damping, f"{effort}·s/{unit}")
+        if self.effort_limit is not None:
+            check_amount("field actuator.effort_limit", self.effort_limit, effort)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointEntry:
@@ -90,8 +99,8 @@ class JointEntry:
         if not self.name:
             raise refusal("name", self.name, "the name of a joint of the MJCF")
         for name in ("sensor_noise", "sensor_resolution"):
-            if getattr(self, name) < 0:
-                raise refusal(name, getattr(self, name), "0 or more")
+            if not SENSOR[self.unit].holds(getattr(self, name)):
+                raise refusal(name, getattr(self, name), str(SENSOR[self.unit]))
         if self.velocity_limit is not None and self.velocity_limit <= 0:
             raise refusal("velocity_limit", self.velocity_limit, "a number above 0, or null for no limit")
         low, high = self.position_range or (-math.inf, math.inf)
@@ -99,6 +108,13 @@ class JointEntry:
             raise refusal("position_range", [low, high], "two numbers, the lower one first, or null")
         if not low <= self.default_position <= high:
             raise refusal("default_position", self.default_position, f"{low:g} to {high:g} (position_range)")
+        check_amount("field default_position", self.default_position, self.unit)
+        for end in self.position_range or ():
+            check_amount("field position_range", end, self.unit)
+        if self.velocity_limit is not None:
+            check_amount("field velocity_limit", self.velocity_limit, f"{self.unit}/s")
+        if self.actuator is not None:
+            self.actuator.check_amounts(self.unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,8 +156,9 @@ class RobotFile:
         if not self.mjcf:
             raise refusal("mjcf", self.mjcf, "the path of the MJCF, relative to this file")
         for name in ("control_rate_hz", "state_rate_hz"):
-            if not 1e-3 <= getattr(self, name) <= 1e6:
-                raise refusal(name, getattr(self, name), "0.001 to 1000000 Hz")
+            if not 1e-3 <= getattr(self, name):
+                raise refusal(name, getattr(self, name), "0.001 Hz or more")
+            check_amount(f"field {name}", getattr(self, name), "Hz")
         ratio = self.state_rate_hz / self.control_rate_hz
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
             raise refusal(
@@ -152,10 +169,6 @@ class RobotFile:
         names = [joint.name for joint in self.joints]
         if not 0 < len(names) <= NAMES or len(set(names)) != len(names):
             raise refusal("joints", names, "each joint once, at least one")
-        if all(joint.actuator is None for joint in self.joints):
-            raise ConfigurationError(
-                "no joint has an actuator; write `actuator: {...}` for those that take commands"
-            )
         if self.physics_step is not None and not 1e-6 <= self.physics_step <= 1:
             raise refusal("physics_step", self.physics_step, "the MJCF's timestep, 1e-6 to 1 s, or null")
         self._check_hardware()

@@ -14,6 +14,7 @@ import numpy as np
 
 from deal_hw.description import RobotDescription
 from deal_hw.errors import ConfigurationError, shown
+from deal_hw.reading import reading
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.mjcf.describe import WINDOW_TICKS, Sampling, describe, sampling
 from deal_hw.sim.mjcf.joint_facts import joint_facts
@@ -147,15 +148,15 @@ def derive_robot(
             if servo:
                 low, high = max(low, facts.command[j, 0]), min(high, facts.command[j, 1])
         ranged = math.isfinite(low) and math.isfinite(high)
-        joints.append(
-            JointEntry(
+        with reading(f"model {mjcf}, joint {joint}", "a joint of a robot", error=ConfigurationError):
+            entry = JointEntry(
                 name=joint,
                 unit="m" if facts.units[j] == "m" else "rad",
                 default_position=float(np.clip(base.default_position[j], low, high)),
                 position_range=(float(low), float(high)) if ranged else None,
                 actuator=actuator,
             )
-        )
+        joints.append(entry)
     file = RobotFile(
         version=1,
         name=name or mjcf.stem,

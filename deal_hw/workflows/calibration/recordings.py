@@ -140,7 +140,10 @@ def at_rest_without_commands(
             found.append(table)
             continue
         off = f"its motors ({', '.join(driven)}) were off" if driven else "the model has no actuators"
-        say(f"{table.name}: no commands, and {off}: it is taken as a motion of the joints alone")
+        say(
+            f"{table.name}: no commands, and {off}: it is taken as a motion of the joints alone. It shows "
+            "friction, damping and armature relative to the masses of the model; of masses, too, only ratios"
+        )
         table = dataclasses.replace(
             table, actuated=driven, command_s=np.zeros(1), target=np.zeros((1, len(driven)))
         )

@@ -5,13 +5,9 @@ A calibration that is stopped writes its best fit so far, and keeps the state fr
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import math
 import os
-import shutil
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -20,117 +16,44 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from deal_hw import findings
 from deal_hw.calibration import (
-    BEFORE_SEARCH,
     LATENCY,
     LATENCY_RANGE_S,
     Budget,
     CalibrationResult,
-    Progress,
     ProgressCallback,
-    percent,
 )
-from deal_hw.errors import ConfigurationError, InsufficientDataError, MissingExtraError
-from deal_hw.findings import Finding
+from deal_hw.errors import (
+    DatasetError,
+    DealHwError,
+    InsufficientDataError,
+    MissingExtraError,
+    ModelNotWrittenError,
+)
+from deal_hw.findings import SafeChecks
 from deal_hw.parameters import ParameterSpace
 from deal_hw.scale.tasks import task_map
 from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.result_folder import (
+    HELD_OUT,
+    BestSoFar,
+    ResultFolder,
+    UnfinishedCalibrationError,
+    unfinished,
+)
 from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSettings
 from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import PopulationPolicy
     from deal_hw.calib.report.gather import ReportInputs
-    from deal_hw.calib.validation.metrics import HeldoutErrors
+    from deal_hw.calib.validation.metrics import HeldOut, HeldoutErrors
     from deal_hw.sim.engine.gpu import WantedEngine
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
     from deal_hw.workflows.calibration.intake import CalibrationInput
-
-
-CHECKPOINT = "checkpoint.npz"
-SO_FAR = "so_far"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ResultFolder:
-    """The folder of a calibration: its state while it runs, then its results.
-
-    Attributes:
-        path: The folder.
-        resume: Continue from the state that a stopped calibration has left there.
-
-    Raises:
-        ConfigurationError: There is no such state.
-    """
-
-    path: Path
-    resume: bool = False
-
-    def __post_init__(self) -> None:
-        if self.resume and not self.checkpoint.exists():
-            raise ConfigurationError(
-                f"nothing to resume: {self.checkpoint} does not exist; leave --resume out to begin a "
-                "calibration"
-            )
-
-    @property
-    def checkpoint(self) -> Path:
-        """File of the state; removed when the results are written."""
-        return self.path / CHECKPOINT
-
-    @property
-    def so_far(self) -> Path:
-        """Folder of the best fit of a stopped calibration; removed when the results are written."""
-        return self.path / SO_FAR
-
-    def write(
-        self,
-        robot: RobotModel,
-        result: CalibrationResult,
-        report: ReportInputs | None = None,
-        *,
-        stopped: bool = False,
-    ) -> dict[str, Path]:
-        """Write a result and return its files by name. A Ctrl-C takes effect after the last file.
-
-        Args:
-            robot: The robot.
-            result: The result.
-            report: Contents of report.html; None: it is not written.
-            stopped: It is the best fit of a stopped calibration: the state to resume from stays.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C; the files are complete.
-        """
-        from deal_hw.calib.report.page import write_result
-        from deal_hw.data.files import interrupts_deferred
-
-        # A Ctrl-C here must neither lose an hour's work nor leave half of the files.
-        with interrupts_deferred():
-            files = write_result(self.so_far if stopped else self.path, robot, result, report)
-            if not stopped:
-                self.checkpoint.unlink(missing_ok=True)
-                shutil.rmtree(self.so_far, ignore_errors=True)
-        return files
-
-    @contextlib.contextmanager
-    def resumable(self) -> Iterator[None]:
-        """On Ctrl-C say where the state is and how to continue, and raise the interrupt again."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            if self.checkpoint.exists():
-                to_stderr(
-                    f"\ncalibration stopped; its state is in {self.checkpoint}. The same command with "
-                    "--resume continues, to the same result"
-                )
-            else:
-                to_stderr(
-                    "\ncalibration stopped before the search; there is no state to --resume, begin again"
-                )
-            raise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,91 +63,17 @@ class CalibrateReport:
     Attributes:
         result: The result.
         files: The files by name.
+        problem: Why there are fewer files than usual; None if there are all.
     """
 
     result: CalibrationResult
     files: dict[str, Path]
-
-
-class BestSoFar:
-    """Receives the progress of a calibration: keeps the best fit for an interrupt, and reports clear gains.
-
-    Args:
-        space: The parameters.
-        judge: Returns the held-out errors of a fit, (K,) and latency [s] with its parameters, as
-            "calibrated", beside "nominal" and "null"; None without held-out data.
-        say: Called with a sentence on each fit whose error is 5 % lower than the one reported before, and
-            with each message before the search.
-        progress: Called with the progress, too; None: nobody else is.
-    """
-
-    def __init__(
-        self,
-        space: ParameterSpace,
-        judge: Callable[[FloatArray, float, ParameterSpace], Mapping[str, float]] | None,
-        say: Say = silent,
-        progress: ProgressCallback | None = None,
-    ) -> None:
-        self._space, self._judge, self._say, self._progress = space, judge, say, progress
-        self._began = time.monotonic()
-        self._error = self._said = math.inf
-        self.result: CalibrationResult | None = None
-
-    def __call__(self, progress: Progress) -> None:
-        """Note a step of the calibration."""
-        if progress.estimate is not None:
-            self._compare(progress, progress.estimate)
-        if progress.stage == BEFORE_SEARCH:
-            self._say(f"{BEFORE_SEARCH}: {progress.message}")
-        if self._progress is not None:
-            self._progress(progress)
-
-    def _compare(self, progress: Progress, estimate: FloatArray) -> None:
-        """Compare a fit with the best one so far."""
-        latency_s = progress.latency_s or 0.0
-        space = progress.space or self._space
-        errors = self._judge(estimate, latency_s, space) if self._judge is not None else {}
-        error = errors.get("calibrated", progress.values.get("chi2", math.inf))
-        if self.result is not None and not error < self._error:
-            return
-        self._error = error
-        space = space.holding(estimate)
-        low_high = np.stack([space.low, space.high], axis=1)
-        self.result = CalibrationResult(
-            method=f"interrupted after {progress.stage}",
-            space=space,
-            estimate=estimate,
-            interval=low_high,
-            latency_s=latency_s,
-            latency_interval_s=(latency_s, latency_s),
-            chi2=progress.values.get("chi2", math.nan),
-            heldout_nrmse=errors,
-            alarms=(
-                Finding.alarm(
-                    f"The calibration was interrupted after {progress.stage}, "
-                    f"{time.monotonic() - self._began:.0f} s.",
-                    "No interval was computed; the given ones are the search ranges.",
-                    "Run the same command with --resume to continue.",
-                ),
-            ),
-        )
-        if self._error > 0.95 * self._said:
-            return
-        self._said = self._error
-        self._say(f"{time.monotonic() - self._began:.0f} s, {progress.stage}: {self.sentence}")
+    problem: DealHwError | None = None
 
     @property
-    def sentence(self) -> str:
-        """Error of the best fit, as a sentence."""
-        if self.result is None:
-            return "no fit yet"
-        errors = self.result.heldout_nrmse
-        if errors:
-            return (
-                f"held-out error {percent(errors['calibrated'])} of the signal's range "
-                f"(your own model: {percent(errors['nominal'])})"
-            )
-        return f"residuals {math.sqrt(max(self.result.chi2, 0.0)):.2g} times the sensor's noise"
+    def exit_code(self) -> int:
+        """For the shell: 0, or 1 if the checks of the result were not made."""
+        return int(self.result.unchecked)
 
 
 def calibrate_input(
@@ -236,7 +85,26 @@ def calibrate_input(
     say: Say = silent,
     results: ResultFolder | None = None,
 ) -> CalibrationResult:
-    """Calibrate with the settings; see :func:`calibrate_episodes`."""
+    """Calibrate with the settings; see :func:`calibrate_episodes`.
+
+    What raises after a fit costs no fit, an hour's work: it is named, and the fit is the result.
+    """
+    try:
+        return calibrate_or_raise(settings, work, method, progress=progress, say=say, results=results)
+    except UnfinishedCalibrationError as err:
+        return err.result
+
+
+def calibrate_or_raise(
+    settings: CalibrateSettings,
+    work: CalibrationInput,
+    method: str,
+    *,
+    progress: ProgressCallback | None = None,
+    say: Say = silent,
+    results: ResultFolder | None = None,
+) -> CalibrationResult:
+    """Calibrate with the settings; errors as :func:`calibrate_episodes`."""
     return calibrate_episodes(
         work.robot,
         work.space,
@@ -324,6 +192,9 @@ def calibrate_episodes(
         engine: What simulates the population of a search.
         guessed: Names of the parameters whose range nobody chose; see
             :mod:`deal_hw.calib.pipeline.wider_ranges`.
+
+    Raises:
+        UnfinishedCalibrationError: Something raised after the first fit; the error has that fit.
     """
     try:
         from threadpoolctl import threadpool_limits
@@ -375,13 +246,15 @@ def calibrate_episodes(
 
     held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
 
-    def errors(of: HeldOut, theta: FloatArray, latency: float) -> HeldoutErrors:
-        return of.errors({"nominal": (of.space.nominal, 0.0), "calibrated": (theta, latency)})
-
     def judge(theta: FloatArray, latency: float, of: ParameterSpace) -> Mapping[str, float]:
-        return {} if held_out is None else errors(held_out.of(of), theta, latency).nrmse
+        return {} if held_out is None else _errors(held_out.of(of), theta, latency).nrmse
 
-    best = BestSoFar(space, judge, say, progress)
+    keeps: dict[str, Any] = {}
+    if results is not None:
+        if not results.resume:
+            results.clear_so_far()
+        keeps = {"keep": partial(results.keep, robot), "next_step": lambda: results.next_step}
+    best = BestSoFar(space, judge, say, progress, **keeps)
     searcher = make_method(method, refine=budget.refine, thorough=thorough, laws=laws)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
@@ -394,25 +267,42 @@ def calibrate_episodes(
             result = searcher.run(problem, budget, rng, best, store)
         except KeyboardInterrupt:
             if results is not None and best.result is not None:
-                results.write(robot, best.result, stopped=True)
-                to_stderr(f"\nbest so far: {best.sentence}; written to {results.so_far}, without intervals")
+                results.write(robot, best.ended("was stopped"), stopped=True)
+                to_stderr(f"\nbest so far: {best.sentence}; written to {results.so_far}, not checked")
             raise
+        except Exception as err:
+            if best.result is None or err is best.raised:
+                raise
+            how = f"ended by an error, {findings.reason_of(err)}"
+            ended = best.ended(how, "Report this error.")
+            raise UnfinishedCalibrationError(f"the calibration {how}", ended) from err
+        best.take(result)
+    safely = SafeChecks()
     from deal_hw.calib.validation.checks import latency_alarms
 
     provenance = result.provenance
     first, last = provenance.get("grown_ranges", {}).get(LATENCY, problem.latency_range_s)
-    alarms = (*result.alarms, *latency_alarms(problem, result.latency_s, (first, last)))
+    more = safely.run("the latency's range", (), latency_alarms, problem, result.latency_s, (first, last))
     if in_loop:
         provenance = {
             **provenance,
             "start_states": "recorded" if problem.start_std is None else "drawn",
             "start_std": dict(start_std or {}),
         }
-    result = dataclasses.replace(result, alarms=alarms, provenance=provenance)
-    if held_out is None:
-        return result
+    result = dataclasses.replace(result, alarms=(*result.alarms, *more), provenance=provenance)
+    if held_out is not None:
+        result = safely.run(HELD_OUT, result, _with_errors, result, held_out)
+    return result.with_failed(safely)
+
+
+def _errors(of: HeldOut, theta: FloatArray, latency_s: float) -> HeldoutErrors:
+    return of.errors({"nominal": (of.space.nominal, 0.0), "calibrated": (theta, latency_s)})
+
+
+def _with_errors(result: CalibrationResult, held_out: HeldOut) -> CalibrationResult:
+    """Return a result with its held-out errors."""
     # Laws and zeros of single recordings became parameters.
-    found = errors(held_out.of(result.space), result.estimate, result.latency_s)
+    found = _errors(held_out.of(result.space), result.estimate, result.latency_s)
     provenance = {**result.provenance, "heldout_rmse": found.to_json()}
     return dataclasses.replace(result, heldout_nrmse=found.nrmse, provenance=provenance)
 
@@ -462,15 +352,41 @@ def finish(
         KeyboardInterrupt: Ctrl-C. A message says whether there are results; if so, they are complete.
     """
     with results.resumable():
-        result, report = judged(work, result, settings, page=page, advise=advise, threads=threads)
+        try:
+            judgement = judged(work, result, settings, page=page, advise=advise, threads=threads)
+        except KeyboardInterrupt:
+            how = "was stopped after its fit, before advice and report"
+            results.write(work.robot, unfinished(result, how, results.next_step), stopped=True)
+            to_stderr(f"\nthe fit is written to {results.so_far}")
+            raise
+    result, report = judgement
     try:
-        files = results.write(work.robot, result, report)
+        return _written(work, result, results, report)
     except KeyboardInterrupt:
         to_stderr(
             f"\ninterrupted after the end of the calibration: the results in {results.path} are complete"
         )
         raise
-    return CalibrateReport(result=result, files=files)
+
+
+def _written(
+    work: CalibrationInput, result: CalibrationResult, results: ResultFolder, report: ReportInputs | None
+) -> CalibrateReport:
+    """Write the result; without the report if that cannot be made."""
+    safely = SafeChecks()
+    for shown in (report, None) if report is not None else (None,):
+        found = result.with_failed(safely)
+        try:
+            return CalibrateReport(result=found, files=results.write(work.robot, found, shown))
+        except ModelNotWrittenError as err:
+            return CalibrateReport(result=found, files=err.files, problem=err)
+        except DatasetError as err:
+            return CalibrateReport(result=found, files={}, problem=err)
+        except Exception as err:
+            if shown is None:
+                raise
+            safely.failed["the report"] = findings.reason_of(err)
+    raise RuntimeError("unreachable: the last attempt returns or raises")
 
 
 def plain_model(work: CalibrationInput, result: CalibrationResult) -> dict[str, Any]:
@@ -491,35 +407,55 @@ def judged(
     advise: bool,
     threads: int | None,
 ) -> tuple[CalibrationResult, ReportInputs | None]:
-    """Return the result with advice and provenance, and the contents of its report."""
+    """Return the result with advice and provenance, and the contents of its report.
+
+    Each is computed of a result that is there already: what cannot be is named, and the result stands.
+    """
+    from deal_hw.sim.plain_model import FACTS
+
+    safely = SafeChecks()
     if advise:
         from deal_hw.calib.design.advice import next_recordings
 
-        found = next_recordings(work.robot, result, work.episodes, balance=work.balance, threads=threads)
+        found = safely.run(
+            "the next recording",
+            (),
+            next_recordings,
+            work.robot,
+            result,
+            work.episodes,
+            balance=work.balance,
+            threads=threads,
+        )
         result = dataclasses.replace(result, advice=tuple(one.to_json() for one in found))
     names = ("deal-hw", "mujoco", "numpy", "scipy", "torch")
+    without = {FACTS: {"error": "it could not be made"}}
     result = dataclasses.replace(
         result,
         provenance={
             **result.provenance,
             **work.provenance,
             **settings,
-            **plain_model(work, result),
+            **safely.run("the model for MuJoCo alone", without, plain_model, work, result),
             "versions": {name: metadata.version(name) for name in names},
             "processors": len(os.sched_getaffinity(0)),
         },
     )
     if not page:
-        return result, None
+        return result.with_failed(safely), None
     from deal_hw.calib.report.gather import gather
 
-    inputs = gather(
+    shown = result.with_failed(safely)
+    inputs = safely.run(
+        "the report",
+        None,
+        gather,
         work.robot,
-        result,
+        shown,
         work.episodes,
         work.holdout,
         telemetry=work.telemetry,
         window_s=settings.get("heldout_window_s", HELDOUT_WINDOW_S),
         threads=threads,
     )
-    return result, inputs
+    return (shown if inputs is not None else result.with_failed(safely)), inputs

@@ -14,6 +14,7 @@ from deal_hw.control.safety.safety import LINK_ERROR_SHARE
 from deal_hw.data.checks.clock_rate import judge_clock
 from deal_hw.errors import DealHwError, TransportTimeoutError
 from deal_hw.findings import Finding, Severity
+from deal_hw.load import Load
 from deal_hw.ranges import Checked, Range
 from deal_hw.robot import Robot
 from deal_hw.robots import default_transport, plug_ins
@@ -26,7 +27,7 @@ from deal_hw.robots.connect import (
     spoilt_on_purpose,
 )
 from deal_hw.transport import WireOptions
-from deal_hw.workflows.causes import Load, corrupt_advice, late_advice
+from deal_hw.workflows.causes import corrupt_advice, late_advice
 from deal_hw.workflows.doctor.machine import examine_machine
 from deal_hw.workflows.options import from_settings, given, refuse
 from deal_hw.workflows.robot_kinds import robot_kinds

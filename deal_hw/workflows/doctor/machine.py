@@ -12,10 +12,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from deal_hw.control.process.realtime import FIFO_PRIORITY
 from deal_hw.errors import DealHwError, short
 from deal_hw.findings import Finding, Severity
 from deal_hw.install import install_line
+from deal_hw.priorities import FIFO_PRIORITY
 
 PACKAGES: Final = (
     ("eclipse-zenoh", "zenoh"),

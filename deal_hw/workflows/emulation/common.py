@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -26,6 +27,7 @@ from deal_hw.workflows.options import File
 from deal_hw.workflows.say import Say, silent
 
 T = TypeVar("T")
+S = TypeVar("S", bound=EmulateSettings)
 _PARENT_CHECK_STEPS = 100
 _FIFO_PRIORITY = 40
 """Below the priority of a control process, since the host must not wait for the emulator."""
@@ -44,6 +46,18 @@ def signalled() -> Iterator[tuple[threading.Event, threading.Event]]:
 
     with taken(handle, ENDING - {signal.SIGTSTP}):
         yield stop, cut
+
+
+def with_parent(config: S) -> S:
+    """Return the settings with the process whose end ends the emulator: by default the one that started it.
+
+    A killed script or shell gives its children no signal, and an emulator would go on at real-time priority.
+    Call it first: while the emulator starts, the other process may end.
+    """
+    # nohup makes a program ignore this signal, which asks it to go on.
+    if config.parent is not None or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        return config
+    return dataclasses.replace(config, parent=os.getppid())
 
 
 @contextlib.contextmanager

@@ -14,10 +14,14 @@ from typing import Any
 
 from typing_extensions import Self
 
+from deal_hw.clock import MonotonicClock
 from deal_hw.errors import TransportError
+from deal_hw.load import TimeLimit
 from deal_hw.ranges import option
 
-START_TIMEOUT_S = 60.0
+START_S = 60.0
+"""How long a verb may take to print its port, without the time in which it waits for a processor [s]."""
+_POLL_S = 1.0
 
 
 class VerbProcess:
@@ -59,14 +63,16 @@ class VerbProcess:
         )
         if self._process.stdout is None:
             raise TransportError(f"{self._what} has no standard output")
-        readable, _, _ = select.select([self._process.stdout], [], [], START_TIMEOUT_S)
+        limit = TimeLimit(self._process.pid, START_S, MonotonicClock())
+        readable: list[Any] = []
+        while not readable and (left_s := limit.left_s) > 0:
+            readable = select.select([self._process.stdout], [], [], min(left_s, _POLL_S))[0]
         line = self._process.stdout.readline().decode() if readable else ""
         word, _, port = line.strip().partition(" ")
         if word != "port" or not port:
+            why = "it ended without a message" if readable else f"not in its time, {limit}"
             _, errors = self.stop()
-            raise TransportError(
-                f"{self._what} did not start: {errors.strip()[-2000:] or 'without a message'}"
-            )
+            raise TransportError(f"{self._what} did not start: {errors.strip()[-2000:] or why}")
         self.port = port
         return port
 

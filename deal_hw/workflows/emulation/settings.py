@@ -153,7 +153,8 @@ class EmulateSettings(Checked):
     and the command."""
 
     parent: Annotated[int | None, Range(1, 2**22)] = None
-    """Stop when the process with this id is no longer the parent. For programs that start an emulator."""
+    """Stop when the process with this id is no longer the parent. By default that is the process which
+    started the emulator, such as a shell or a script: none is left behind. Started with nohup, it goes on."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -177,6 +177,9 @@ def _missing(robot: UserRobot) -> list[Finding]:
 def _held(robot: UserRobot) -> list[Finding]:
     from deal_hw.sim.robots.holding import hold
 
+    if not robot.description().actuated:
+        use = "its recordings can be imported and calibrated; collect, replay and train need actuators"
+        return [Finding("actuators", Severity.NOTE, "no joint has one", use)]
     found = hold(robot)
     what = f"holding for {found.seconds:g} s"
     if found.diverged:

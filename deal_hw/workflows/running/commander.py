@@ -9,16 +9,23 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from deal_hw.clock import MonotonicClock
 from deal_hw.control.process.claim import LocalClaim
-from deal_hw.control.process.realtime import TRANSPORT_PRIORITY, priority
+from deal_hw.control.process.realtime import priority
 from deal_hw.control.process.run_note import RunNote
-from deal_hw.robot import Robot
+from deal_hw.priorities import TRANSPORT_PRIORITY
 from deal_hw.robots.connect import claim_name, wire_claim
-from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.say import Say
 
+if TYPE_CHECKING:
+    from deal_hw.robot import Robot
+    from deal_hw.workflows.running.plan import RunPlan
+
+OTHERS_S = 0.1
+"""How long who takes over from a dead run listens for other commanders [s]. A program that commands motors
+sends 20 times a second at least; one that sends less often is noticed by a run, not here."""
 HOLDS_LAST_COMMAND = (
     "note: {robot} holds its last command for ever. deal-hw makes it passive when a run ends, when one of "
     "its two processes dies, and when a lost connection comes back. If both processes are killed (out of "

@@ -28,12 +28,14 @@ from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
 from deal_hw.data.recording.recorder_launch import start_recorder
 from deal_hw.errors import DealHwError
+from deal_hw.load import Load
 from deal_hw.robot import Robot
 from deal_hw.robots import balanced, robot_entry, walked
 from deal_hw.robots.connect import on_this_computer, spoilt_on_purpose
 from deal_hw.signals import OPERATOR, name
 from deal_hw.version import __version__
-from deal_hw.workflows.causes import LATE, Load, corrupt_advice, late_advice
+from deal_hw.workflows.causes import LATE, corrupt_advice, late_advice
+from deal_hw.workflows.running.commander import OTHERS_S
 from deal_hw.workflows.running.plan import RunPlan
 from deal_hw.workflows.running.report import EpisodeReport
 from deal_hw.workflows.running.sleep_lock import ASLEEP
@@ -68,8 +70,7 @@ class EpisodeRun:
         say: Say = silent,
         note: RunNote | None = None,
     ) -> None:
-        self._note, self._say = note, say
-        self._keep_fds = keep_fds if note is None else (*keep_fds, note.fileno())
+        self._note, self._say, self._keep_fds = note, say, keep_fds
         self.signal = ""
         """Name of the signal by which the operator ended it, or ""."""
         self._supervisor: Supervisor | None = None
@@ -111,10 +112,11 @@ class EpisodeRun:
             module="deal_hw.workflows.running.control_process",
             plan=self._plan.to_json(),
             port_fd=port_fd if port_fd >= 0 else None,
-            passive=lambda phase, already_tried: self._make_passive(phase, already_tried, on_beat),
+            passive=lambda phase, tried: self._make_passive(supervisor, phase, tried, on_beat),
             recorder=recorder,
             on_beat=on_beat,
             keep_fds=self._keep_fds,
+            note=self._note,
         )
         if self._stop_cause:
             supervisor.stop(self._stop_cause)
@@ -123,9 +125,7 @@ class EpisodeRun:
                 from deal_hw.workflows.running.keyboard import keys
 
                 listening.enter_context(keys(supervisor.tell, lambda: supervisor.stop(OPERATOR), self._say))
-            self._say_passive(None)
             end = supervisor.run()
-            self._say_passive(end.passive_confirmed)
         self.signal = end.signal
         report = dataclasses.replace(
             account(
@@ -168,10 +168,6 @@ class EpisodeRun:
         if self._supervisor is not None:
             self._supervisor.stop(cause)
 
-    def _say_passive(self, passive: bool | None) -> None:
-        if self._note is not None:
-            self._note.say_passive(passive)
-
     def _walk(self, trajectory: Trajectory) -> VelocityError | None:
         """Return how well the robot followed the requested velocity, by its own sensors."""
         if not robot_entry(self._plan.robot).odometry:
@@ -197,7 +193,9 @@ class EpisodeRun:
         recorded, replayed = read_trajectory(Path(self._plan.recording)), trajectory
         return replay_error(followed_part(recorded), followed_part(replayed), before_s)
 
-    def _make_passive(self, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]) -> bool:
+    def _make_passive(
+        self, supervisor: Supervisor, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]
+    ) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""
         untouched = (
             STARTING,
@@ -211,8 +209,12 @@ class EpisodeRun:
         clock = MonotonicClock()
 
         def tell(text: str, silence_s: float) -> None:
+            supervisor.promise(silence_s)
             on_beat(Beat(clock.now_ns(), silence_s, f"{MAKING_PASSIVE}: {text}", 0))
 
+        if supervisor.was_away and (who := self._robot.other_commander(OTHERS_S)):
+            self._say(f"not made passive after this program was stopped: {who}")
+            return False
         config = _TRIED_AGAIN if already_tried else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
         return make_passive(self._robot, clock, config, progress=tell)
 

@@ -67,6 +67,7 @@ def run_simulated(
 
     own = user_robot(robot)
     description = own.description()
+    description.require_actuators()
     space = default_space(description)
     truth = draw_truth(space, options.truth_seed, options.truth_ratio, options.truth_latency)
     # Errors of robot or motion must be reported before anything is written.

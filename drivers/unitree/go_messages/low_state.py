@@ -134,6 +134,12 @@ class LowStateFrame(JointFrame):
         return np.frombuffer(self.payload, np.uint32).take(at).astype(np.int64)
 
     @property
+    def mode(self) -> IntArray:
+        """Of each motor, (J,)."""
+        at = layout.STATE_MODE_AT[self.order.motors]
+        return np.frombuffer(self.payload, np.uint8).take(at).astype(np.int64)
+
+    @property
     def foot_force(self) -> IntArray:
         """Sensor units, (4,)."""
         return np.frombuffer(self.payload, np.int16, 4, 1084).take(self.order.feet).astype(np.int64)
@@ -151,7 +157,6 @@ class LowStateFrame(JointFrame):
     def values(self) -> LowState:
         """Return all values, each array a copy of its own."""
         record = np.frombuffer(self.payload, layout.LOW_STATE)[0]
-        modes = np.frombuffer(self.payload, "u1")[layout.STATE_MODE_AT[self.order.motors]]
         return LowState(
             position=self.position.copy(),
             velocity=self.velocity.copy(),
@@ -159,7 +164,7 @@ class LowStateFrame(JointFrame):
             effort=self.effort.copy(),
             temperature=self.temperature,
             lost=self.lost,
-            mode=modes.astype(np.int64),
+            mode=self.mode,
             orientation=self.orientation.copy(),
             angular_velocity=self.angular_velocity.copy(),
             specific_force=self.specific_force.copy(),
