@@ -58,8 +58,8 @@ class Ros2Device:
     Attributes:
         active: Whether the controller is active; an inactive one receives commands and ignores them.
         host_origin_ns: Host clock at device time 0, for the log [ns].
-        changes: What happened: device time [ms], host time [ns] and the event. "moves" and "holds" say
-            whether the newest two commands differ.
+        changes: What happened: device time [ms], host time [ns] and the event; those of commands are of
+            :mod:`deal_hw.drivers.ros2.command_log`.
         accepted: Commands that the controller took.
         refused: Commands that it could not use.
 
@@ -121,8 +121,6 @@ class Ros2Device:
         self._frozen = False
         self._freeze_tick: int | None = None
         self._coming: deque[tuple[int, FloatArray, int]] = deque()
-        self._newest: FloatArray | None = None
-        self._commanded = ""
         self.place(np.array(d.default_position))
 
     def place(self, position: FloatArray) -> None:
@@ -161,12 +159,6 @@ class Ros2Device:
         if self.accepted == 1:
             self._first_ns = self.device_ns
             self._joint_faults.begin(self.device_ns)
-        if self._newest is not None:
-            commanded = "holds" if np.array_equal(target, self._newest) else "moves"
-            if commanded != self._commanded:
-                self._note(commanded, stamp_ns)
-                self._commanded = commanded
-        self._newest = target
         due = math.ceil((self.device_ns + self._latency_ns) / self._tick_ns - 1e-6)
         # The controller reads commands at the manager's updates.
         due = -(-due // self._stride) * self._stride
