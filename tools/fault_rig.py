@@ -380,8 +380,10 @@ class Rig(ABC):
         """Wait until the emulator's fault is over and some time has passed; run again: it must finish.
 
         Raises:
-            SpoiledError: The fault never ended.
+            SpoiledError: The fault never began, because the run ended before it commanded; or it never ended.
         """
+        if not any(what in self.active for _, what in self.events):
+            raise SpoiledError(f"the run ended before it commanded: {headline(self.output)}")
         due = time.monotonic() + PATIENCE_S
         while not any(self.event_ns(what) for what in self.over):
             if time.monotonic() > due:

@@ -1,4 +1,4 @@
-"""The emulated controller's log: which commands move the robot, which hold it, and how fast joints were after."""
+"""The emulated controller's log: commands that move or hold the robot, and speeds of joints after events."""
 
 from __future__ import annotations
 
