@@ -245,10 +245,12 @@ WORDS = (
     "No push lasts, and none rises and falls by half of the drive's limit, so the run goes on. When the",
     "drives come back after 2 s, the joints run to the moving set-point at 1.1 to 2.7 rad/s. In virtual time",
     "the same happens with drives that are limp from 2.0 s of the motion on: the cause is the rule, not the",
-    "machine's load. Times of 2.01 and 2.04 s are such motions, too. The set-points of the next run begin at",
-    "0.5 rad/s at most, and its joints moved at 0.59 to 0.73 rad/s, a little more than on the first way to the",
-    "start pose (0.53 to 0.70 rad/s), but once at 0.77 rad/s, after a pause of the whole machine of 53 ms. Two",
-    "runs ended as failed (exit code 2) without a fault, one of them the next run: the machine was busy.",
+    "machine's load. Times of 2.01 and 2.04 s are such motions, too.",
+    "",
+    "The set-points of the next run begin at 0.5 rad/s at most. Its joints moved at 0.59 to 0.73 rad/s, a",
+    "little more than on the first way to the start pose (0.53 to 0.70 rad/s), but once at 0.77 rad/s, after",
+    "a pause of the whole machine of 53 ms. Two runs ended as failed (exit code 2) without a fault, one of",
+    "them the next run: the machine was busy.",
     "",
 )
 
