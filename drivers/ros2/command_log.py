@@ -22,7 +22,7 @@ Event = tuple[int, int, str]
 """Device time [ms], host time [ns], what happened."""
 
 
-class CommandLog:
+class Ros2CommandLog:
     """Commands and speeds of an emulated robot; tests compute from it what a fault led to.
 
     Targets and speeds are those of the actuated joints, (A,) [rad or m; rad/s or m/s].

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.ros2.command_log import HOLDS, MOVES, CommandLog, Event
+from deal_hw.drivers.ros2.command_log import HOLDS, MOVES, Ros2CommandLog, Event
 from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.messages import (
     ACTIVE,
@@ -94,7 +94,7 @@ class Ros2Device:
         self.changes: list[tuple[int, int, str]] = []
         self.accepted = self.refused = self.sent = 0
         self._last_refusal = ""
-        self._log = CommandLog()
+        self._log = Ros2CommandLog()
         self._description, self._section, self._truth = d, section, truth
         self._topics = topics_of(section)
         self._actuated = np.array(d.actuated_index)

@@ -8,7 +8,7 @@ import numpy as np
 from ros2_rig import Ros2Rig
 
 from deal_hw.control.safety.passive import make_passive
-from deal_hw.drivers.ros2.command_log import AGAIN, FIRST, HOLDS, MOVES, CommandLog
+from deal_hw.drivers.ros2.command_log import AGAIN, FIRST, HOLDS, MOVES, Ros2CommandLog
 from deal_hw.drivers.ros2.emulator import ros2_device
 from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.messages import encode_positions
@@ -25,7 +25,7 @@ def events(rig: Ros2Rig) -> list[str]:
 
 def test_the_same_target_again_holds_from_its_first_command_on() -> None:
     """The second one shows it; the event has the time of the first."""
-    log = CommandLog()
+    log = Ros2CommandLog()
     found = [
         log.take(at_ms * MS, at_ms, np.array(target), AT)
         for at_ms, target in ((0, (0.1, 0.0)), (20, (0.2, 0.0)), (40, (0.3, 0.0)), (60, (0.3, 0.0)))
@@ -39,7 +39,7 @@ def test_the_same_target_again_holds_from_its_first_command_on() -> None:
 
 def test_a_command_after_a_pause_is_an_event() -> None:
     """Another run begins there."""
-    log = CommandLog()
+    log = Ros2CommandLog()
     log.take(0, 0, AT, AT)
     assert log.take(499 * MS, 499, AT, AT) == [(0, 0, HOLDS)]
     assert log.take(999 * MS, 999, AT, AT) == [(999, 999, AGAIN)]
@@ -47,7 +47,7 @@ def test_a_command_after_a_pause_is_an_event() -> None:
 
 def test_speeds_count_for_a_second_after_each_event() -> None:
     """Of two events that are close, each has its own second."""
-    log = CommandLog()
+    log = Ros2CommandLog()
     log.watch(1000 * MS, 5, "limp")
     log.move(1100 * MS, np.array((0.2, -0.3)))
     log.watch(1500 * MS, 6, "sound")
