@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.description import RobotDescription
-from deal_hw.drivers.ros2.command_log import HOLDS, MOVES, Ros2CommandLog, Event
+from deal_hw.drivers.ros2.command_log import HOLDS, MOVES, Event, Ros2CommandLog
 from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.messages import (
     ACTIVE,
