@@ -49,7 +49,7 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_NUM_THREADS=1 $(BIN)/python -m pyte
 test: $(STAMP) test-peers ## all tests that need no robot, but the slow ones
 	$(PYTEST) -m 'not slow' $(PYTEST_ARGS)
 
-test-slow: $(STAMP) test-peers ## the other tests: long searches and calibrations, and the fault rows of the Go2
+test-slow: $(STAMP) test-peers ## the other tests: long searches and calibrations, the fault rows of the Go2, and fault tables
 	$(PYTEST) -m slow $(PYTEST_ARGS)
 
 test-peers:

@@ -1,11 +1,9 @@
 """What a search costs on other machines: a model of the measured rows, checked on others.
 
-A generation costs the physics of all members, which cores or a GPU share, and the rest: critic, policy and
-arithmetic of one process, which they do not. The rest is linear in the members; its two numbers are fitted to
-the cart-pole's rows of `bench speed` with fewer than 400 members, and scaled to each task's own row. Rows
-that took no part in that are predicted, and the error is printed. Physics on a GPU is that of
-docs/how-to/gpu.md. The DEAL paper's search has one world for each member; `deal` and `eki` one for each
-member and window.
+A generation costs the physics of all members, which cores share, and the rest: critic, policy and arithmetic
+of one process, which they do not. The rest is linear in the members; its two numbers are fitted to the
+cart-pole's rows of `bench speed` with fewer than 400 members, and scaled to each task's own row. Rows that
+took no part in that are predicted, and the error is printed.
 
 .venv/bin/python tools/cost_model.py
 .venv/bin/python tools/cost_model.py --members 200,4096 --cores 2,16,64
@@ -25,20 +23,6 @@ from deal_hw.bench.rows import load_rows
 from deal_hw.workflows.say import text_table
 
 MEASURED = Path(__file__).resolve().parents[1] / "docs" / "measured"
-
-H200: Final = {
-    "cartpole": (2.23e6, 8.86e6, 20.2e6),
-    "ant": (0.832e6, 1.11e6, 1.53e6),
-    "allegro": (0.550e6, 0.985e6, 0.957e6),
-    "go2": (0.842e6, 1.94e6, 1.78e6),
-    "humanoid": (0.506e6, 0.652e6, 0.657e6),
-}
-"""Physics steps a second at `H200_WORLDS` worlds: the table of docs/how-to/gpu.md."""
-
-H200_WORLDS: Final = (1024, 4096, 16384)
-
-WINDOWS: Final = 20
-"""Windows in the bench's 2 s of recording: worlds on a GPU for each member of `deal` and `eki`."""
 
 RAY_SHARE: Final = 0.03
 """Share of a core that Ray's own processes take while workers run (docs/how-to/cluster.md)."""
@@ -61,20 +45,13 @@ class Cost:
     member_s: float
 
     def rest(self, members: int) -> float:
-        """Return the seconds of a generation that no further core or GPU shares."""
+        """Return the seconds of a generation that no further core shares."""
         return self.fixed_s + self.member_s * members
 
     def on_cores(self, members: int, cores: int) -> float:
         """Return a generation's seconds on so many cores; a member is simulated on one."""
         busy = min(cores, members)
         return members * self.steps * self.step_s / busy + self.rest(members)
-
-    def on_gpu(self, members: int, rates: Sequence[float], windows: int = 1) -> float:
-        """Return a generation's seconds on a GPU; fewer worlds than measured take as long as those."""
-        measured = [n / rate for n, rate in zip(H200_WORLDS, rates, strict=True)]
-        worlds = members * windows
-        step_s = float(np.interp(worlds, H200_WORLDS, measured)) * max(worlds / H200_WORLDS[-1], 1.0)
-        return self.steps / windows * step_s + self.rest(members)
 
 
 def rest_of(row: dict[str, Any]) -> float:
@@ -141,7 +118,7 @@ def main() -> None:
         usual = [row for row in rows if row["population"] == 100]
         known = checked(method, usual, [row for row in rows if row not in usual or row["task"] == "cartpole"])
         for count in (100, 1000):
-            show(known, count, args.generations, cores, WINDOWS)
+            show(known, count, args.generations, cores)
 
 
 def checked(
@@ -161,20 +138,16 @@ def checked(
     return known
 
 
-def show(
-    known: dict[str, Cost], members: int, generations: int, cores: Sequence[int], windows: int = 1
-) -> None:
-    """Print what generations take on machines with so many cores, and on an H200."""
+def show(known: dict[str, Cost], members: int, generations: int, cores: Sequence[int]) -> None:
+    """Print what generations take on machines with so many cores."""
     print(f"\n{generations} generations of {members} members [s]; in brackets the share of the rest:")
     rows = []
     for task, cost in known.items():
-        taken = [cost.on_cores(members, n) for n in cores] + [cost.on_gpu(members, H200[task], windows)]
+        taken = [cost.on_cores(members, n) for n in cores]
         cells = [f"{generations * t:.0f} ({cost.rest(members) / t:.0%})" for t in taken]
         balance = members * cost.steps * cost.step_s / cost.rest(members)
         rows.append((task, *cells, f"{balance:.0f}"))
-    print(
-        text_table(("task", *(f"{n} cores" for n in cores), "H200", "cores at which the rest is half"), rows)
-    )
+    print(text_table(("task", *(f"{n} cores" for n in cores), "cores at which the rest is half"), rows))
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ def faulty(one: FleetRobot, profile: str, fault: str, seed: int) -> dict[str, An
             sent_ns = record.start_ns
             if begun_ns < 0 and record.start_ns - first_ns >= at_s * 1e9:
                 begun_ns = record.start_ns
-                made.joints.give(faults, made.device_ns)
+                made.device.joint_faults.give(faults, made.device.device_ns)
             if begun_ns >= 0:
                 far = max(far, _distance(record, d.actuated_index))
         return True

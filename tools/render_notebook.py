@@ -1,6 +1,6 @@
 """Run a notebook of examples/ and write its page of the documentation: text, code, output, figures.
 
-python tools/render_notebook.py      (hidden_payload.ipynb; ten seconds)
+python tools/render_notebook.py      (hidden_payload.ipynb)
 
 The notebook itself is committed without outputs. A test compares the page's code with the notebook's.
 """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -17,41 +17,51 @@ from arm_rig import arm_file
 from measure_wire_calibration import virtual_wire
 from ros2_rig import ros2_file
 
-from deal_hw.clock import VirtualClock
+from deal_hw.clock import Clock, VirtualClock
 from deal_hw.control.loop.control_loop import ControlLoop, LoopConfig, LoopReport
 from deal_hw.control.safety.safety import Safety
 from deal_hw.data.recording.record import CycleRecord
 from deal_hw.drivers.b2.emulator import B2Truth
+from deal_hw.drivers.b2.fault_rows import B2, B2_ON_STAND
 from deal_hw.drivers.b2.robot import B2OnStandRobot, B2Robot
+from deal_hw.drivers.cartpole import fault_rows
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth as draw_cartpole
 from deal_hw.drivers.cartpole.plant.profiles import PROFILES
 from deal_hw.drivers.g1.emulator.device import G1Device
 from deal_hw.drivers.g1.emulator.truth import G1Truth
+from deal_hw.drivers.g1.fault_rows import G1
 from deal_hw.drivers.g1.robot import G1Robot
 from deal_hw.drivers.go2.emulator.device import Go2Device
 from deal_hw.drivers.go2.emulator.truth import Go2Truth
+from deal_hw.drivers.go2.fault_rows import GO2, GO2_ON_STAND
 from deal_hw.drivers.go2.robot import Go2OnStandRobot, Go2Robot
 from deal_hw.drivers.h1.emulator import H1Device, H1Truth
+from deal_hw.drivers.h1.fault_rows import H1
 from deal_hw.drivers.h1.robot import H1Robot
+from deal_hw.drivers.ros2 import fault_rows as ros2_rows
 from deal_hw.drivers.ros2.emulator import ros2_device
 from deal_hw.drivers.ros2.robot import Ros2ControlRobot
+from deal_hw.drivers.servo_arm import fault_rows as arm_rows
 from deal_hw.drivers.servo_arm.emulator import arm_device
 from deal_hw.drivers.servo_arm.families import FAMILIES
 from deal_hw.drivers.servo_arm.robot import ServoArm
 from deal_hw.drivers.so101.description import emulated_space
 from deal_hw.drivers.so101.emulator import so101_device
+from deal_hw.drivers.so101.fault_rows import SO101
 from deal_hw.drivers.so101.robot import so101_arm
 from deal_hw.drivers.transports.virtual_topics import VirtualTopics
 from deal_hw.drivers.transports.virtual_transport import VirtualTransport
 from deal_hw.motions.excitation.behaviours import RichConfig
 from deal_hw.motions.planned_end import PlannedEnd
-from deal_hw.motions.posture import limited_for
+from deal_hw.motions.posture import PostureConfig, limited_for
 from deal_hw.parameters import ParameterSpace
 from deal_hw.robot import Robot
 from deal_hw.robots.file_emulator import LATENCY_S, RANGE_RATIO
 from deal_hw.sim.robots.file_description import file_description
 from deal_hw.sim.robots.simulated import SimulatedTruth, default_space, draw_truth
-from deal_hw.testing.joint_faults import FaultyJoints
+from deal_hw.testing.fault_rows import FaultRig, FaultTable
+from deal_hw.testing.virtual_processes import World
+from deal_hw.transport import TopicTransport, Transport
 from deal_hw.workflows.running.plan import RunPlan, make_behaviour
 from deal_hw.workflows.shipped import required_policy
 
@@ -67,29 +77,21 @@ class VirtualRobot:
     """One robot, ready to run.
 
     Attributes:
-        robot: Its driver.
+        driver: Makes a driver of it over a wire and its clock.
         clock: The clock that all share.
         wire: The virtual wire.
         device: The emulated device.
+        robot: A driver.
     """
 
-    robot: Robot
+    driver: Callable[[Any, Any], Robot]
     clock: VirtualClock
     wire: Any
     device: Any
+    robot: Robot = field(init=False)
 
-    @property
-    def joints(self) -> FaultyJoints:
-        """Faults of its joints."""
-        mechanics = getattr(self.device, "_mechanics", None)
-        found: FaultyJoints = mechanics.joint_faults if mechanics else self.device._joint_faults
-        return found
-
-    @property
-    def device_ns(self) -> int:
-        """Time of its joints' faults [ns]."""
-        mechanics = getattr(self.device, "_mechanics", None)
-        return int(mechanics._now_ns if mechanics else self.device.device_ns)
+    def __post_init__(self) -> None:
+        self.robot = self.driver(self.wire, self.clock)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +103,8 @@ class FleetRobot:
         make: Makes it from a profile and a seed.
         motions: Name of a motion -> fields of its :class:`RunPlan`.
         profiles: The emulator's profiles.
+        faults: Its fault table.
+        fault_plan: What differs in the plan of a run with a fault.
     """
 
     name: str
@@ -108,11 +112,29 @@ class FleetRobot:
     motions: Mapping[str, Mapping[str, Any]]
     profiles: tuple[str, ...] = tuple(PROFILES)
     plan: Mapping[str, Any] = field(default_factory=dict)
+    faults: FaultTable
+    fault_plan: Mapping[str, Any] = field(default_factory=dict)
 
     def run_plan(self, motion: str, seed: int) -> RunPlan:
         """Return the plan of a motion."""
         values = {"seconds": SECONDS, "seed": seed, **self.plan, **self.motions[motion]}
         return RunPlan(**values)
+
+    def fault_rig(self, seed: int = 0) -> FaultRig:
+        """Return the robot, just switched on, for a run with a fault."""
+        made = self.make("ideal", seed)
+        plan = RunPlan(**{"seconds": 4.0, "seed": seed, **self.plan, **self.fault_plan})
+        d = made.robot.description
+        return FaultRig(
+            table=self.faults,
+            description=d,
+            world=World(made.clock, made.wire),
+            topics=isinstance(made.wire, VirtualTopics),
+            make_robot=made.driver,
+            make_behaviour=lambda end: make_behaviour(plan, d, end=end),
+            make_next=lambda end: make_behaviour(replace(plan, motion="hold"), d, end=end),
+            seconds=plan.longest_s,
+        )
 
 
 def run(
@@ -148,6 +170,20 @@ def cases(fleet: Mapping[str, FleetRobot], names: tuple[str, ...]) -> Iterator[t
 
 # The robots.
 
+CARTPOLES: Final = {
+    "serial": fault_rows.SERIAL,
+    "can": fault_rows.CAN,
+    "odrive": fault_rows.ODRIVE,
+    "dynamixel": fault_rows.DYNAMIXEL,
+}
+ARMS: Final = {"feetech": arm_rows.FEETECH, "dynamixel": arm_rows.DYNAMIXEL}
+CONTROLLERS: Final = {"position": ros2_rows.POSITION, "trajectory": ros2_rows.TRAJECTORY}
+"""Fault tables by wire, by bus and by kind of controller."""
+UP_S: Final = 600
+"""How long a robot with a clock of its own has been on [s]."""
+_SHORT: Final = PostureConfig(fold_s=0.6, rise_s=1.0, settle_s=0.2, lie_s=1.0)
+"""Standing up and lying down in less time than usual."""
+
 _EXCITE: Final = {
     "chirp": {"motion": "excite", "excite": "chirp"},
     "multisine": {"motion": "excite", "excite": "multisine"},
@@ -156,8 +192,11 @@ _EXCITE: Final = {
 
 def _cartpole(wire: str, profile: str, seed: int) -> VirtualRobot:
     virtual = virtual_wire(wire, draw_cartpole(profile, seed, range_ratio=CARTPOLE_RATIO))
-    transport = virtual._transport
-    return VirtualRobot(virtual.robot(transport, virtual.clock), virtual.clock, transport, virtual.device)
+    if wire != "dynamixel":
+        # It was switched on a while ago.
+        device: Any = virtual.device
+        device.firmware.clock_us = UP_S * 1_000_000
+    return VirtualRobot(virtual.robot, virtual.clock, virtual._transport, virtual.device)
 
 
 def _truth(space: ParameterSpace, profile: str, seed: int) -> SimulatedTruth:
@@ -168,8 +207,7 @@ def _so101(profile: str, seed: int) -> VirtualRobot:
     clock = VirtualClock(10**12)
     truth = _truth(emulated_space(), profile, seed)
     device = so101_device(truth, noisy=profile != "ideal")
-    wire = VirtualTransport(device, clock)
-    return VirtualRobot(so101_arm(wire, clock), clock, wire, device)
+    return VirtualRobot(so101_arm, clock, VirtualTransport(device, clock), device)
 
 
 def _arm(bus: str, profile: str, seed: int) -> VirtualRobot:
@@ -185,8 +223,12 @@ def _arm(bus: str, profile: str, seed: int) -> VirtualRobot:
         _truth(space, profile, seed),
         noisy=profile != "ideal",
     )
-    wire = VirtualTransport(device, clock)
-    return VirtualRobot(ServoArm(wire, clock, d, file.servo_bus, FAMILIES[bus]()), clock, wire, device)
+    wire, section = VirtualTransport(device, clock), file.servo_bus
+
+    def driver(wire: Transport, clock: Clock) -> ServoArm:
+        return ServoArm(wire, clock, d, section, FAMILIES[bus]())
+
+    return VirtualRobot(driver, clock, wire, device)
 
 
 def _ros2(command: str, profile: str, seed: int) -> VirtualRobot:
@@ -196,36 +238,43 @@ def _ros2(command: str, profile: str, seed: int) -> VirtualRobot:
     d, clock = file_description(file, folder / "arm.xml"), VirtualClock(10**12)
     truth = _truth(default_space(d), profile, seed)
     device = ros2_device(file.ros2, d, truth, noisy=profile != "ideal")
-    wire = VirtualTopics(device, clock)
-    return VirtualRobot(Ros2ControlRobot(wire, clock, d, file.ros2), clock, wire, device)
+    wire, section = VirtualTopics(device, clock), file.ros2
+
+    def driver(wire: TopicTransport, clock: Clock) -> Ros2ControlRobot:
+        return Ros2ControlRobot(wire, clock, d, section)
+
+    return VirtualRobot(driver, clock, wire, device)
 
 
 def _unitree(device: Callable[[], Any], driver: Callable[..., Robot]) -> VirtualRobot:
     clock, made = VirtualClock(10**9), device()
-    wire = VirtualTopics(made, clock)
-    return VirtualRobot(driver(wire, clock), clock, wire, made)
+    return VirtualRobot(driver, clock, VirtualTopics(made, clock), made)
 
 
 def _go2(on_stand: bool, profile: str, seed: int) -> VirtualRobot:
     truth = Go2Truth.draw(profile, seed)
-    device = partial(Go2Device, truth, on_stand=on_stand, sport="")
+    device = partial(Go2Device, truth, on_stand=on_stand, sport="", tick_ms=1000 * UP_S)
     return _unitree(device, Go2OnStandRobot if on_stand else Go2Robot)
 
 
 def _b2(on_stand: bool, profile: str, seed: int) -> VirtualRobot:
     truth = B2Truth.draw(profile, seed)
-    device = partial(Go2Device, truth, on_stand=on_stand, sport="")
+    device = partial(Go2Device, truth, on_stand=on_stand, sport="", tick_ms=1000 * UP_S)
     return _unitree(device, B2OnStandRobot if on_stand else B2Robot)
 
 
 def _g1(profile: str, seed: int) -> VirtualRobot:
     truth = G1Truth.draw(profile, seed, robot="g1")
-    return _unitree(lambda: G1Device(truth), partial(G1Robot, hung_on_crane=True))
+    return _unitree(
+        lambda: G1Device(truth, controller="", tick_ms=1000 * UP_S), partial(G1Robot, hung_on_crane=True)
+    )
 
 
 def _h1(profile: str, seed: int) -> VirtualRobot:
     truth = H1Truth.draw(profile, seed, robot="h1")
-    return _unitree(lambda: H1Device(truth), partial(H1Robot, hung_on_crane=True))
+    return _unitree(
+        lambda: H1Device(truth, controller="", tick_ms=1000 * UP_S), partial(H1Robot, hung_on_crane=True)
+    )
 
 
 def _balancing() -> dict[str, Any]:
@@ -272,14 +321,18 @@ def fleet() -> dict[str, FleetRobot]:
                 make=partial(_cartpole, wire),
                 motions=cartpole_motions,
                 plan=_balancing(),
+                faults=table,
+                fault_plan=_EXCITE["multisine"],
             )
-            for wire in ("serial", "can", "odrive", "dynamixel")
+            for wire, table in CARTPOLES.items()
         ),
         FleetRobot(
             name="so101",
             make=_so101,
             profiles=sensors,
             plan={"robot": "so101"},
+            faults=SO101,
+            fault_plan=_EXCITE["multisine"],
             motions={
                 **arm_motions,
                 "reach": {"motion": "balance", "policy": str(required_policy("so101")), "target": POSES},
@@ -292,8 +345,10 @@ def fleet() -> dict[str, FleetRobot]:
                 profiles=sensors,
                 plan={"robot": "arm"},
                 motions=arm_motions,
+                faults=table,
+                fault_plan=_EXCITE["multisine"],
             )
-            for bus in ("feetech", "dynamixel")
+            for bus, table in ARMS.items()
         ),
         *(
             FleetRobot(
@@ -302,13 +357,17 @@ def fleet() -> dict[str, FleetRobot]:
                 profiles=sensors,
                 plan={"robot": "arm"},
                 motions=arm_motions,
+                faults=table,
+                fault_plan=_EXCITE["multisine"],
             )
-            for command in ("position", "trajectory")
+            for command, table in CONTROLLERS.items()
         ),
         FleetRobot(
             name="go2",
             make=partial(_go2, False),
             plan={"robot": "go2"},
+            faults=GO2,
+            fault_plan={**_walking("walk", "0.6,0.2,0.4"), "posture": _SHORT, "seconds": 3.5},
             motions={
                 "walk": _walking("walk", "0.6,0.2,0.4"),
                 "walk back": _walking("walk", "-0.5,-0.2,-0.5"),
@@ -318,16 +377,39 @@ def fleet() -> dict[str, FleetRobot]:
             },
         ),
         FleetRobot(
-            name="go2_on_stand", make=partial(_go2, True), plan={"robot": "go2_on_stand"}, motions=stand
+            name="go2_on_stand",
+            make=partial(_go2, True),
+            plan={"robot": "go2_on_stand"},
+            motions=stand,
+            faults=GO2_ON_STAND,
+            fault_plan=_EXCITE["multisine"],
         ),
         FleetRobot(
             name="b2",
             make=partial(_b2, False),
             plan={"robot": "b2"},
             motions={"hold": {"motion": "hold", "stand": True}},
+            faults=B2,
+            fault_plan={"motion": "hold", "stand": True, "posture": _SHORT, "seconds": 1.0},
         ),
-        FleetRobot(name="b2_on_stand", make=partial(_b2, True), plan={"robot": "b2_on_stand"}, motions=stand),
-        FleetRobot(name="g1", make=_g1, plan={"robot": "g1"}, motions=stand),
-        FleetRobot(name="h1", make=_h1, plan={"robot": "h1"}, motions=stand),
+        FleetRobot(
+            name="b2_on_stand",
+            make=partial(_b2, True),
+            plan={"robot": "b2_on_stand"},
+            motions=stand,
+            faults=B2_ON_STAND,
+            fault_plan=_EXCITE["multisine"],
+        ),
+        *(
+            FleetRobot(
+                name=name,
+                make=make,
+                plan={"robot": name},
+                motions=stand,
+                faults=table,
+                fault_plan={**_EXCITE["multisine"], "seconds": SECONDS},
+            )
+            for name, make, table in (("g1", _g1, G1), ("h1", _h1, H1))
+        ),
     ]
     return {one.name: one for one in robots}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Final
 
 import numpy as np
@@ -14,6 +14,8 @@ from deal_hw.types import FloatArray
 
 HELD_DAMPING: Final = 1e3
 """Damping of a joint that is held, where the simulation has no better way [N·m·s/rad]."""
+WHOLE_TURN: Final = 2 * np.pi
+"""An out-of-range reading, where the robot's sensors can show it [rad or m]: no joint turns so far."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,9 +46,15 @@ class JointFaults(Checked):
     turned_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
     """The reading of a joint has the other sign after this time [s]."""
 
+    out_of_range_after_s: Annotated[float | None, Range(0, 1e7, "s")] = None
+    """The reading of a joint lies outside of its range after this time [s]."""
+
+
+_BEGINS: Final = tuple(one.name for one in fields(JointFaults) if one.name.endswith("_after_s"))
+
 
 class FaultyJoints:
-    """The same in device time.
+    """The same in device time; they may also be given while the robot runs.
 
     Attributes:
         limp: Whether the drives have no torque now.
@@ -54,29 +62,37 @@ class FaultyJoints:
         source: The joint that each reading shows, (J,).
         sign: Sign of each reading, (J,).
         frozen: Readings that stand still, (J,).
+        outside: Readings outside of their range, (J,).
+        beyond: What these show, (J,) [rad or m].
 
     Args:
         faults: The faults.
         joints: Names of all joints, J.
         driven: Indices of the joints with a drive.
+        beyond: As the attribute; by default :data:`WHOLE_TURN`.
 
     Raises:
         UnknownNameError: As :meth:`give`.
     """
 
-    def __init__(self, faults: JointFaults, joints: Sequence[str], driven: Sequence[int]) -> None:
-        if faults.faulty_joint and faults.faulty_joint not in joints:
-            raise UnknownNameError("--faulty-joint", faults.faulty_joint, joints)
+    def __init__(
+        self,
+        faults: JointFaults,
+        joints: Sequence[str],
+        driven: Sequence[int],
+        beyond: FloatArray | None = None,
+    ) -> None:
         self._joints, self._driven = tuple(joints), tuple(driven)
-        self._first_ns: int | None = None
         self._last: tuple[FloatArray, FloatArray] | None = None
-        self.limp = self.held = False
-        self.source = np.arange(len(joints))
-        self.sign, self.frozen = np.ones(len(joints)), np.zeros(len(joints), dtype=bool)
+        self.beyond = np.full(len(joints), WHOLE_TURN) if beyond is None else beyond
         self.give(faults)
 
     def give(self, faults: JointFaults, now_ns: int | None = None) -> None:
-        """Take other faults, whose times count from a time [ns]; None: from :meth:`begin`.
+        """Take other faults in place of the present ones.
+
+        Args:
+            faults: The faults.
+            now_ns: Their times count from this time [ns]; None: from :meth:`begin`.
 
         Raises:
             UnknownNameError: No joint has the name of the faulty one.
@@ -85,6 +101,11 @@ class FaultyJoints:
         if name and name not in self._joints:
             raise UnknownNameError("--faulty-joint", name, self._joints)
         self._faults, self._first_ns = faults, now_ns
+        self._none = all(getattr(faults, name) is None for name in _BEGINS)
+        count = len(self._joints)
+        self.limp = self.held = False
+        self.source, self.sign = np.arange(count), np.ones(count)
+        self.frozen, self.outside = np.zeros((2, count), dtype=bool)
         self._joint = self._joints.index(name) if name else driven[0]
         others = [j for j in driven if j != self._joint] or [self._joint]
         self._other = next((j for j in others if j > self._joint), others[0])
@@ -98,6 +119,7 @@ class FaultyJoints:
             "frozen reading": self.frozen.any(),
             "exchanged readings": (self.source != np.arange(len(self.source))).any(),
             "turned reading": (self.sign < 0).any(),
+            "reading out of range": self.outside.any(),
         }
         return next((text for text, is_so in wrong.items() if is_so), "")
 
@@ -108,7 +130,7 @@ class FaultyJoints:
 
     def advance(self, now_ns: int) -> str | None:
         """Take the time [ns]; return :attr:`now` where something began or ended, else None."""
-        if self._first_ns is None:
+        if self._none or self._first_ns is None:
             return None
         passed_s, f, before = (now_ns - self._first_ns) * 1e-9, self._faults, self.now
 
@@ -123,11 +145,14 @@ class FaultyJoints:
             self.source[[j, other]] = other, j
         if during(f.turned_after_s):
             self.sign[j] = -1.0
+        if during(f.out_of_range_after_s):
+            self.outside[j] = True
         return None if self.now == before else self.now
 
     def read(self, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the readings show of positions and velocities, (J,) each."""
         seen = position[self.source] * self.sign, velocity[self.source] * self.sign
+        seen = np.where(self.outside, self.beyond, seen[0]), seen[1]
         if self._last is not None and self.frozen.any():
             before, before_velocity = self._last
             seen = np.where(self.frozen, before, seen[0]), np.where(self.frozen, before_velocity, seen[1])

@@ -16,10 +16,13 @@ from deal_hw.drivers.ros2.messages import (
     ACTIVE,
     INACTIVE,
     JointStates,
+    TrajectoryPoint,
     decode_point,
     decode_positions,
     encode_activity,
     encode_joint_states,
+    encode_point,
+    encode_positions,
 )
 from deal_hw.drivers.ros2.topics import topics_of
 from deal_hw.errors import FrameError
@@ -57,6 +60,7 @@ class Ros2Device:
 
     Attributes:
         active: Whether the controller is active; an inactive one receives commands and ignores them.
+        joint_faults: Faults of the joints; may be given at any time.
         host_origin_ns: Host clock at device time 0, for the log [ns].
         changes: What happened: device time [ms], host time [ns] and the event; those of commands are of
             :mod:`deal_hw.drivers.ros2.command_log`.
@@ -108,7 +112,7 @@ class Ros2Device:
         self._step_of_sensor = d.sensor.resolution
         self._batch = ServoBatch(robot, space, 1, threads=1)
         self._batch.set_parameters(np.array([[truth.parameters[name] for name in space.names]]))
-        self._joint_faults = FaultyJoints(joint_faults or JointFaults(), d.joint_names, d.actuated_index)
+        self.joint_faults = FaultyJoints(joint_faults or JointFaults(), d.joint_names, d.actuated_index)
         self._drive(limp=False)
         self._effort = self._batch.batch.bind("qfrc_actuator")
         self._dofs = list(robot.qvel)
@@ -118,6 +122,7 @@ class Ros2Device:
         self._stride = max(round(d.device_rate_hz / d.state_rate_hz), 1)
         self._latency_ns = round(1e9 * truth.latency_s)
         self._tick = self._cut_end = 0
+        self._clock_ns = EPOCH_NS
         self._frozen = False
         self._freeze_tick: int | None = None
         self._coming: deque[tuple[int, FloatArray, int]] = deque()
@@ -158,7 +163,7 @@ class Ros2Device:
         self.accepted += 1
         if self.accepted == 1:
             self._first_ns = self.device_ns
-            self._joint_faults.begin(self.device_ns)
+            self.joint_faults.begin(self.device_ns)
         due = math.ceil((self.device_ns + self._latency_ns) / self._tick_ns - 1e-6)
         # The controller reads commands at the manager's updates.
         due = -(-due // self._stride) * self._stride
@@ -178,14 +183,15 @@ class Ros2Device:
         if not self._frozen and self._tick % self._stride == 0:
             while self._coming and self._coming[0][0] <= self._tick:
                 _, target, ticks = self._coming.popleft()
-                self._move = _Move(self._setpoint(), target, self._tick, self._tick + ticks)
+                self._move = _Move(self.setpoint, target, self._tick, self._tick + ticks)
             out = [*self._activity(), *self._states()]
-        if (event := self._joint_faults.advance(self.device_ns)) is not None:
+        if (event := self.joint_faults.advance(self.device_ns)) is not None:
             self._note(event or "sound")
-            self._drive(limp=self._joint_faults.limp)
+        if self.joint_faults.limp != self._limp:
+            self._drive(limp=self.joint_faults.limp)
         before = self._batch.position.copy()
-        self._batch.advance(self._setpoint()[None, None])
-        if self._joint_faults.held:
+        self._batch.advance(self.setpoint[None, None])
+        if self.joint_faults.held:
             self._batch.set_state(before, np.zeros_like(before))
         self._log.move(self.device_ns, self._batch.velocity[0][self._actuated])
         self._tick += 1
@@ -202,13 +208,7 @@ class Ros2Device:
         passed_s = (self.device_ns - first_ns) * 1e-9 - faults.controller_off_after_s
         active = not 0.0 <= passed_s < faults.controller_off_s
         if active != self.active:
-            self.active = active
-            self._note("controller active" if active else "controller off")
-        if active and passed_s >= 0.0 and self._section.command == "trajectory":
-            self._controller_faults = ControllerFaults(silent_manager=faults.silent_manager)
-            # A joint trajectory controller holds the pose in which it is activated.
-            at = self._batch.position[0][self._actuated].copy()
-            self._move = _Move(at, at, 0, 0)
+            self.switch(active=active)
 
     def _activity(self) -> list[tuple[str, bytes]]:
         """Return the controller_manager's message where a controller's state changed."""
@@ -217,7 +217,33 @@ class Ros2Device:
         self._told_active = self.active
         name = self._section.controller.strip("/").rpartition("/")[2]
         states = {"joint_state_broadcaster": ACTIVE, name: ACTIVE if self.active else INACTIVE}
-        return [(self._topics.activity, encode_activity(EPOCH_NS + self.device_ns, states))]
+        return [(self._topics.activity, encode_activity(self._clock_ns + self.device_ns, states))]
+
+    def switch(self, *, active: bool) -> None:
+        """Activate the controller, or deactivate it: then the drives hold their set-points."""
+        self.active = active
+        self._note("controller active" if active else "controller off")
+        if active and self._section.command == "trajectory":
+            # A joint trajectory controller holds the pose in which it is activated.
+            at = self._batch.position[0][self._actuated].copy()
+            self._move = _Move(at, at, 0, 0)
+
+    def jump_clock(self, seconds: float) -> None:
+        """Let the stamps jump ahead, or back if negative [s]."""
+        self._clock_ns += round(seconds * 1e9)
+
+    def command_aside(self, by: float) -> tuple[str, bytes]:
+        """Return topic and message by which another program wants the joints aside of where they are.
+
+        Args:
+            by: How far [rad or m].
+        """
+        target = (self._batch.position[0][self._actuated] + by)[self._place]
+        if self._section.command == "trajectory":
+            return self._topics.commands, encode_point(
+                TrajectoryPoint(tuple(self._command_names), target, 0.1)
+            )
+        return self._topics.commands, encode_positions(target)
 
     def cut(self, seconds: float) -> None:
         """Let nothing pass in either direction for a while [s]."""
@@ -249,6 +275,7 @@ class Ros2Device:
 
     def _drive(self, *, limp: bool) -> None:
         """Give the drives the description's gains, or none."""
+        self._limp = limp
         d, share = self._description, 0.0 if limp else 1.0
         self._batch.set_sent(
             share * np.array(d.stiffness), share * np.array(d.damping), np.array(d.effort_limit)
@@ -280,7 +307,9 @@ class Ros2Device:
         target[self._place] = position
         return target, after_s
 
-    def _setpoint(self) -> FloatArray:
+    @property
+    def setpoint(self) -> FloatArray:
+        """Set-points of the drives now, (A,) [rad or m]."""
         move = self._move
         if self._tick >= move.to_tick:
             return move.end
@@ -289,10 +318,10 @@ class Ros2Device:
 
     def _states(self) -> list[tuple[str, bytes]]:
         position = reported(self._batch.position[0], self._noise, self._step_of_sensor, self._rng)
-        position, velocity = self._joint_faults.read(position, self._batch.velocity[0])
+        position, velocity = self.joint_faults.read(position, self._batch.velocity[0])
         payload = encode_joint_states(
             JointStates(
-                stamp_ns=EPOCH_NS + self.device_ns,
+                stamp_ns=self._clock_ns + self.device_ns,
                 names=self._names,
                 position=position[self._order],
                 velocity=velocity[self._order],

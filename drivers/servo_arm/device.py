@@ -12,6 +12,7 @@ import numpy as np
 from deal_hw.drivers.servo_arm.emulated_families import EmulatedJoint
 from deal_hw.drivers.servo_arm.families import DAMPING, OFF, ON
 from deal_hw.drivers.servo_arm.faults import ArmFaults
+from deal_hw.drivers.servo_bus.faults import BusFaults
 from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN, WAY_TICKS, OtherMaster
 from deal_hw.drivers.servo_bus.servos_side import ServosSide
 from deal_hw.errors import ConfigurationError
@@ -20,7 +21,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.robots.hardware_section import RAD, TICKS, HardwareSection
 from deal_hw.sim.robots.simulated import SimulatedTruth
-from deal_hw.testing.joint_faults import FaultyJoints, JointFaults
+from deal_hw.testing.joint_faults import WHOLE_TURN, FaultyJoints, JointFaults
 from deal_hw.types import FloatArray
 
 BRAKE: Final = 0.55
@@ -29,6 +30,9 @@ BRAKE: Final = 0.55
 _LOOK_TICKS: Final = 5
 """Physics steps between two looks of the servos' protections, which take ten milliseconds and more. A request
 that comes between them is answered with what is measured then."""
+
+_BEYOND_RAD: Final = 0.2
+"""How far beyond its range a reading stands that is out of range [rad]."""
 
 
 class ArmDevice:
@@ -41,6 +45,7 @@ class ArmDevice:
         joints: The servos, in the order of the joints.
         bus: Their side of the wire.
         received_bytes: Number of bytes from the host.
+        joint_faults: Faults of the joints; may be given at any time.
 
     Args:
         hardware: The servos' zeros, directions and gains.
@@ -82,7 +87,12 @@ class ArmDevice:
         self._dofs = list(robot.qvel)
         self._of_id = {servo.id: j for j, servo in enumerate(self._servos)}
         self._due = self._schedule(faults or ArmFaults())
-        self._joint_faults = FaultyJoints(joint_faults or JointFaults(), d.joint_names, d.actuated_index)
+        # A servo shows one turn only.
+        ends = np.array([high for _, high in d.limits.trip_position])
+        beyond = np.where(np.isfinite(ends), ends + _BEYOND_RAD, WHOLE_TURN)
+        self.joint_faults = FaultyJoints(
+            joint_faults or JointFaults(), d.joint_names, d.actuated_index, beyond
+        )
         self._first_ns: int | None = None
         self._other: OtherMaster | None = None
         self._bus_trouble = ""
@@ -158,7 +168,7 @@ class ArmDevice:
     def trouble(self) -> str:
         """Current fault of a servo; "" for none."""
         found = (joint.trouble(self._now_ns) for joint in self.joints)
-        return next((trouble for trouble in found if trouble), self._bus_trouble or self._joint_faults.now)
+        return next((trouble for trouble in found if trouble), self._bus_trouble or self.joint_faults.now)
 
     @property
     def frame_errors(self) -> int:
@@ -207,8 +217,8 @@ class ArmDevice:
             (faults.servo_absent_after_s, lambda: joint.unplug(self._now_ns)),
             (faults.servo_reboot_after_s, lambda: joint.restart(self._now_ns)),
             (faults.servo_overload_after_s, joint.overload),
-            (faults.duplicate_id_after_s, lambda: self._double(joint)),
-            (faults.foreign_writer_after_s, lambda: self._let_write(joint, faults)),
+            (faults.duplicate_id_after_s, lambda: self.double(joint)),
+            (faults.foreign_writer_after_s, lambda: self.let_write(joint, faults)),
         ]
         return sorted(((at_s, act) for at_s, act in acts if at_s is not None), key=lambda due: due[0])
 
@@ -221,25 +231,30 @@ class ArmDevice:
                 return
             self._due.pop(0)[1]()
 
-    def _double(self, joint: EmulatedJoint) -> None:
+    def double(self, joint: EmulatedJoint) -> None:
         """Plug in a second servo with a servo's id."""
         self.bus.servos.append(joint.servo.twin())
         self._bus_trouble = DOUBLED
 
-    def _let_write(self, joint: EmulatedJoint, faults: ArmFaults) -> None:
+    def let_write(self, joint: EmulatedJoint, faults: BusFaults) -> None:
         """Let another program write a servo's goals."""
         # Towards the middle of its ticks.
         goal = joint.goal + (WAY_TICKS if joint.goal < TICKS // 2 else -WAY_TICKS)
         self._other = OtherMaster(joint.goal_packet(goal), self.bus, faults, self._now_ns)
         self._bus_trouble = FOREIGN
 
+    def mend_bus(self) -> None:
+        """Unplug the second servo, and end the other program."""
+        self.bus.servos[len(self.joints) :] = []
+        self._other, self._bus_trouble = None, ""
+
     def _step(self) -> None:
         now_ns = self._tick * self._tick_ns
         if self._due:
             self._fail()
         if self.armed:
-            self._joint_faults.begin(now_ns)
-        if self._joint_faults.advance(now_ns) is not None:
+            self.joint_faults.begin(now_ns)
+        if self.joint_faults.advance(now_ns) is not None:
             self._stale = True
         if self._other is not None and self._other.advance(now_ns):
             self._take_goals(now_ns)
@@ -252,7 +267,7 @@ class ArmDevice:
             self._stale = False
         before = self._batch.position.copy()
         self._batch.advance(self._setpoint[None, None, self._actuated])
-        if self._joint_faults.held:
+        if self.joint_faults.held:
             self._batch.set_state(before, np.zeros_like(before))
         self._hold()
         self._take_state()
@@ -304,7 +319,7 @@ class ArmDevice:
                 self._setpoint[j] = self._held.setdefault(int(j), float(self._position[j]))
             else:
                 self._held.pop(int(j), None)
-        if self._joint_faults.limp:
+        if self.joint_faults.limp:
             kp, kd = np.zeros_like(kp), np.zeros_like(kd)
         sent = (*kp, *kd, *effort)
         if sent != self._sent:
@@ -327,7 +342,7 @@ class ArmDevice:
 
         A servo samples faster than a physics step: between two steps the joint moves on at its velocity.
         """
-        faults = self._joint_faults
+        faults = self.joint_faults
         if faults.frozen[j]:
             return
         joint, servo = self.joints[j], self._servos[j]
@@ -336,6 +351,8 @@ class ArmDevice:
         position = (
             sign * float(self._position[shown]) + 1e-9 * (now_ns - self._tick * self._tick_ns) * velocity
         )
+        if faults.outside[j]:
+            position = float(faults.beyond[j])
         if self._noisy:
             position += self._rng.standard_normal() * self._description.sensor.noise[j]
         most = self._most[j]

@@ -53,7 +53,7 @@ class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
 
     def publish(self, topic: str, payload: bytes) -> None:
         """Let another program publish a message now."""
-        self._catch_up()
+        self.run_ticks()
         self._arrive(topic, payload, self._clock.now_ns())
 
     def send(self, message: Message) -> None:
@@ -69,7 +69,7 @@ class VirtualTopics(VirtualWire[TopicCore], TopicTransport):
                 f"virtual wire: topic {message.channel!r} is not declared for publishing; declared: "
                 f"{', '.join(sorted(self._publish)) or '(none)'}"
             )
-        self._catch_up()
+        self.run_ticks()
         self.device.receive(message.channel, message.payload, self._clock.now_ns())
 
     def _run_tick(self, tick_ns: int) -> None:

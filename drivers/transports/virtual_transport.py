@@ -35,10 +35,22 @@ class VirtualTransport(VirtualWire[DeviceCore]):
     def send(self, message: Message) -> None:
         """Give bytes to the device, at the time of the clock, which may lie between two ticks."""
         self._check()
-        self._catch_up()
+        self.run_ticks()
         if isinstance(self.device, TimedCore):
             self.device.set_time(self._clock.now_ns() - self._origin_ns)
         self.device.receive(message.payload)
+
+    def inject(self, data: bytes, *, seen: bool) -> None:
+        """Let another program send bytes to the device now.
+
+        Args:
+            data: The bytes.
+            seen: Whether the host receives them, too, as on a bus.
+        """
+        self.run_ticks()
+        self.device.receive(data)
+        if seen:
+            self._queue.append(Message("", data, self._clock.now_ns()))
 
     def _run_tick(self, tick_ns: int) -> None:
         if data := self.device.tick():

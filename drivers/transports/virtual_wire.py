@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections import deque
+from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from deal_hw.clock import VirtualClock
@@ -30,6 +31,10 @@ class VirtualWire(Transport, Generic[CoreT]):
     Waiting in :meth:`receive` moves the clock, one device tick after the other, until a message arrives or
     the time has passed. A message's stamp is the time at which the device sent it.
 
+    Attributes:
+        device: The device.
+        after_tick: Called after each tick of the device with its time [ns].
+
     Args:
         device: The device; its time 0 is the clock's time now.
         clock: The clock that everybody shares.
@@ -38,6 +43,7 @@ class VirtualWire(Transport, Generic[CoreT]):
 
     def __init__(self, device: CoreT, clock: VirtualClock, queue_size: int = 4096) -> None:
         self.device = device
+        self.after_tick: Callable[[int], None] = lambda tick_ns: None
         self._clock = clock
         self._origin_ns = clock.now_ns() - device.device_ns
         self._queue: deque[Message] = deque(maxlen=queue_size)
@@ -48,7 +54,7 @@ class VirtualWire(Transport, Generic[CoreT]):
         if self._unplugged:
             raise TransportLostError("virtual wire: the device was unplugged")
         if not self._is_open:
-            self._catch_up()
+            self.run_ticks()
             self._queue.clear()
             self._is_open = True
 
@@ -67,21 +73,29 @@ class VirtualWire(Transport, Generic[CoreT]):
     def receive(self, timeout_s: float) -> Message:
         """Return the oldest message, moving the clock up to ``timeout_s`` if there is none yet."""
         self._check()
-        self._catch_up()
+        self.run_ticks()
         deadline_ns = self._clock.now_ns() + max(0, round(timeout_s * 1e9))
         while not self._queue:
-            tick_ns = self._origin_ns + self.device.device_ns
+            tick_ns = self.next_tick_ns
             if tick_ns > deadline_ns:
                 self._clock.sleep_until_ns(deadline_ns)
                 raise TransportTimeoutError(f"virtual wire: nothing arrived within {timeout_s:g} s")
             self._clock.sleep_until_ns(tick_ns)
             self._run_tick(tick_ns)
+            self.after_tick(tick_ns)
         return self._queue.popleft()
 
-    def _catch_up(self) -> None:
+    @property
+    def next_tick_ns(self) -> int:
+        """Time of the device's next tick, by the shared clock [ns]."""
+        return self._origin_ns + self.device.device_ns
+
+    def run_ticks(self) -> None:
+        """Run the ticks that are due by the clock."""
         now_ns = self._clock.now_ns()
-        while (tick_ns := self._origin_ns + self.device.device_ns) <= now_ns:
+        while (tick_ns := self.next_tick_ns) <= now_ns:
             self._run_tick(tick_ns)
+            self.after_tick(tick_ns)
 
     @abc.abstractmethod
     def _run_tick(self, tick_ns: int) -> None:

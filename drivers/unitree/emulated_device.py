@@ -26,6 +26,8 @@ STATE_MS: Final = 2
 STOP_COMBINATION: Final = "L2+B"
 SUBSCRIBED: Final = (topics.LOW_COMMAND, *(topics.request(name) for name in topics.SERVICES))
 """Topics that the robot reads."""
+ASIDE_RAD: Final = 0.2
+"""How far aside another program wants the joints [rad]."""
 _MOST_RESTS: Final = 16
 _RESTS: dict[tuple[int, bytes, bytes, SensorProfile], tuple[Any, FloatArray, FloatArray, FloatArray]] = {}
 """Simulation and motors of robots at rest, by how they began."""
@@ -44,6 +46,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
     Attributes:
         subscribed: Topics that it reads.
         log: The user's commands, with times.
+        joint_faults: Faults of the joints; may be given at any time.
         host_origin_ns: Host clock at device time 0, for the log [ns]; the caller keeps it correct.
 
     Args:
@@ -87,7 +90,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         self._jitter_rng = jitter_rng
         self._service_of = {topics.request(name): name for name in topics.SERVICES}
         self._state_faults = StateFaults(plan, fault_rng)
-        self._joint_faults = FaultyJoints(plan.joints, joints, range(len(joints)))
+        self.joint_faults = FaultyJoints(plan.joints, joints, range(len(joints)))
         self._due = deque(plan.due())
         self._inbox: list[tuple[str, bytes, int]] = []
         self._commands: deque[tuple[int, CommandT]] = deque()
@@ -107,6 +110,15 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
     def true_position(self) -> FloatArray:
         """True joint positions, (J,) [rad]; not reported."""
         return self._sim.position()
+
+    @property
+    def stiff(self) -> bool:
+        """Whether a motor follows a position or gives a commanded torque."""
+        return self._motors.stiff
+
+    def jump_clock(self, seconds: float) -> None:
+        """Let the robot's clock jump ahead, or back if negative [s]."""
+        self._tick_offset += round(seconds * 1e3)
 
     def receive(self, topic: str, payload: bytes, stamp_ns: int = 0) -> None:
         """Take a message; the next tick handles it.
@@ -137,7 +149,7 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         out += self._command_drives(now)
         velocity = self._sim.velocity()
         self._motors.update(self._sim.position(), velocity)
-        if self._joint_faults.limp or self._joint_faults.held:
+        if self.joint_faults.limp or self.joint_faults.held:
             self._motors.give_no_torque()
         if now % STATE_MS == 0:
             self._motors.warm(STATE_MS * 1e-3)
@@ -149,6 +161,10 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
         for topic, _ in out:
             self._sent[topic] += 1
         return out
+
+    def command_aside(self) -> bytes:
+        """Return the message by which another program holds the joints a little aside of where they are."""
+        return self._stiff_message(self._sim.position() + self._bias + ASIDE_RAD)
 
     def begin_fault(self, name: str) -> None:
         """Begin a fault; a plan calls this function at its time.
@@ -171,6 +187,14 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
     @abc.abstractmethod
     def _own_name(self) -> str:
         """Mode of its own controller; "" once released."""
+
+    @abc.abstractmethod
+    def leave_own(self) -> None:
+        """Let its own controller leave the robot at once, whatever it does; the motors keep its command."""
+
+    @abc.abstractmethod
+    def _stiff_message(self, position: FloatArray) -> bytes:
+        """Return a message that holds the joints at positions, (J,) [rad]."""
 
     @abc.abstractmethod
     def _update_own(self, now: int) -> None:
@@ -215,20 +239,20 @@ class UnitreeDevice(abc.ABC, Generic[CommandT]):
     # The steps of a tick.
 
     def _let_time_pass(self, now: int) -> None:
+        now_ns = now * TICK_NS
         if self.log.first_stiff_ms is not None:
             while self._due and self._due[0][0] <= now:
                 self.begin_fault(self._due.popleft()[1])
-            now_ns = now * TICK_NS
-            self._joint_faults.begin(now_ns)
-            if (event := self._joint_faults.advance(now_ns)) is not None:
-                self.log.begin(event or "sound joints", now, self.host_origin_ns + now_ns)
+            self.joint_faults.begin(now_ns)
+        if (event := self.joint_faults.advance(now_ns)) is not None:
+            self.log.begin(event or "sound joints", now, self.host_origin_ns + now_ns)
 
     def _move(self, velocity: FloatArray) -> None:
         """Run a physics step with the present motor efforts, from these velocities (J,)."""
         if self._profile.stribeck_ratio:
             slow = np.exp(-np.square(velocity / self._profile.stribeck_rad_s))
             self._sim.set_frictionloss(self._friction * (1.0 + self._profile.stribeck_ratio * slow))
-        held = HELD_DAMPING if self._joint_faults.held else 0.0
+        held = HELD_DAMPING if self.joint_faults.held else 0.0
         self._sim.set_damping(self._joint_damping + self._motors.brake + held)
         self._sim.step(self._motors.constant)
 

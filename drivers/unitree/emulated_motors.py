@@ -78,6 +78,11 @@ class PdMotors:
         self._tau = np.where(on, command.effort, 0.0)
         self.mode = command.mode
 
+    @property
+    def stiff(self) -> bool:
+        """Whether a motor has a stiffness or a torque in force."""
+        return bool(self._kp.any() or self._tau.any())
+
     def lose(self, joint: int) -> None:
         """Disconnect a motor: it gives no torque and misses every command from now on."""
         self._alive[joint] = 0.0

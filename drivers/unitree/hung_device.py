@@ -35,6 +35,8 @@ PUBLISHED: Final = (
     topics.LOW_COMMAND,
 )
 """Topics that the robot writes; the last one is its own controller's."""
+ASIDE_NM_RAD: Final = 40.0
+"""Stiffness of another program's commands."""
 CommandT = TypeVar("CommandT", bound=MotorCommand)
 
 
@@ -190,6 +192,13 @@ class HungDevice(UnitreeDevice[CommandT]):
     def _own_name(self) -> str:
         return self._own.name
 
+    def leave_own(self) -> None:
+        """Let its own controller leave the robot at once."""
+        self._own.name = ""
+
+    def _stiff_message(self, position: FloatArray) -> bytes:
+        return self._encode(self._hold(position, ASIDE_NM_RAD, 1.0))
+
     def _update_own(self, now: int) -> None:
         if self._own.update(now):
             self._motors.accept(self._own.damped())
@@ -222,7 +231,7 @@ class HungDevice(UnitreeDevice[CommandT]):
         position = sim.position() + self._bias + noise[0]
         if p.position_resolution:
             position = np.rint(position / p.position_resolution) * p.position_resolution
-        position, velocity = self._joint_faults.read(position, sim.velocity() + noise[1])
+        position, velocity = self.joint_faults.read(position, sim.velocity() + noise[1])
         if self._broken >= 0:
             position[self._broken] = velocity[self._broken] = math.nan
         orientation, angular_velocity, specific_force = self._true_body()

@@ -93,7 +93,7 @@ class Wire(VirtualTransport):
         if not (self.silent or self.deaf):
             return super().receive(timeout_s)
         self._clock.sleep_until_ns(self._clock.now_ns() + round(timeout_s * 1e9))
-        self._catch_up()
+        self.run_ticks()
         self._queue.clear()
         raise TransportTimeoutError("silence")
 
@@ -271,7 +271,7 @@ def test_states_that_say_armed_keep_the_path_as_it_is() -> None:
     class Deaf(CartpoleDevice):
         def receive(self, data: bytes) -> None:
             """Hear nothing, and be spared by the watchdog."""
-            self._firmware._alive_tick = 10**9  # type: ignore[attr-defined]
+            self.firmware._alive_tick = 10**9  # type: ignore[attr-defined]
 
     armed.device.__class__ = Deaf
     assert not armed.make_passive(timeout_s=7.0)

@@ -379,11 +379,11 @@ def test_a_state_stream_that_stops_trips(start_emulator: Callable[..., Emulator]
 def test_five_percent_of_corrupt_frames_are_survived_and_reported(
     start_emulator: Callable[..., Emulator], tmp_path: Path
 ) -> None:
-    """The run finishes, the robot is passive, and the operator is informed that an emulator has no cable."""
+    """The run finishes, the robot is passive, and the operator reads that the emulator spoils frames."""
     emulator = start_emulator("--corrupt", "0.05")
     report = run(emulator, tmp_path, seconds=2.0)
     assert report.outcome is Outcome.FINISHED
-    assert any("no cable is at fault" in warning for warning in report.episodes[0].warnings)
+    assert any("spoils frames on purpose" in warning for warning in report.episodes[0].warnings)
     assert Status.ARMED not in emulator.status()
     assert_whole(tmp_path, at_least=95)
 

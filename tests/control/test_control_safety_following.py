@@ -314,6 +314,17 @@ def test_exchanged_readings_name_both_joints() -> None:
     assert "'a' does not follow: its reading fits the set-point of 'b'" in lost.reason
 
 
+def test_exchanged_readings_of_a_pose_that_is_held_are_named() -> None:
+    """A still set-point shows no motion that would fit, but each reading ends at the other one's place."""
+
+    def exchanged(time_s: float) -> tuple[float, float]:
+        part = min(time_s / 0.3, 1.0)
+        return 0.9 - 1.2 * part, -0.3 + 1.2 * part
+
+    found = play(FollowingWatch(robot()), still(0.9, -0.3), exchanged)
+    assert found is not None and "is at the set-point of 'b'" in found[1].reason
+
+
 def test_joints_of_different_units_are_never_exchanged() -> None:
     """A slide's reading in metres is no hinge's."""
     slide = robot(units=("rad", "m"), limit=1e4)

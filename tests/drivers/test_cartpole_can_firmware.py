@@ -492,9 +492,9 @@ def test_an_emulated_node_runs_the_core_where_it_can(monkeypatch: pytest.MonkeyP
 
     def nodes() -> list[object]:
         library.cache_clear()
-        drive = odrive_device(nominal_truth(), OdriveSettings(), firmware="auto")._firmware
+        drive = odrive_device(nominal_truth(), OdriveSettings(), firmware="auto").firmware
         assert isinstance(drive, OdriveFirmware)
-        return [can_device(nominal_truth(), firmware="auto")._firmware, drive._encoder]
+        return [can_device(nominal_truth(), firmware="auto").firmware, drive.encoder]
 
     assert [type(node) for node in nodes()] == [CanHostFirmware, CanHostFirmware]
     monkeypatch.setenv("CC", "no-such-compiler")

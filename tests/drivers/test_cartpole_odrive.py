@@ -389,11 +389,11 @@ def test_an_encoder_that_restarts_is_a_fault() -> None:
     wire = Wire()
     robot = wire.armed()
     assert robot.fault == ""
-    drive = wire.device._firmware
+    drive = wire.device.firmware
     assert isinstance(drive, OdriveFirmware)
-    fresh = odrive_device(nominal_truth("ideal"), WATCHED)._firmware
+    fresh = odrive_device(nominal_truth("ideal"), WATCHED).firmware
     assert isinstance(fresh, OdriveFirmware)
-    drive._encoder = fresh._encoder
+    drive.encoder = fresh.encoder
     wire.clock.advance_ns(20 * MS)
     assert Status.HOMED not in wire.newest().status
     assert "the pole encoder is no longer homed" in robot.fault

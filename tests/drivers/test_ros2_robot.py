@@ -197,7 +197,7 @@ def test_exchanged_joints_far_apart_stop_at_once(tmp_path: Path) -> None:
     rig = Ros2Rig(tmp_path, device_section={"joints": ("shoulder", "elbow")})
     rig.device.place(np.array([0.9, -0.3]))
     rig.robot.connect()
-    with pytest.raises(SafetyError, match=r"shoulder' does not follow: .*'elbow'.* exchanged.* `joints` in"):
+    with pytest.raises(SafetyError, match=r"'elbow' does not follow: .*'shoulder'.* exchanged.* `joints` in"):
         rig.robot.home(20.0)
 
 
@@ -431,7 +431,7 @@ def test_a_trajectory_is_a_straight_line(tmp_path: Path) -> None:
     for _ in range(80):
         at_ms = rig.device.device_ns // 1_000_000
         rig.device.tick()
-        seen[at_ms] = rig.device._setpoint().copy()
+        seen[at_ms] = rig.device.setpoint.copy()
     np.testing.assert_allclose(seen[48], (0.1, 0.2), atol=1e-9)
     np.testing.assert_allclose(seen[98], (0.2, 0.4), atol=1e-9)
 
@@ -497,7 +497,7 @@ class FaultyRun:
                     "limp": JointFaults(limp_after_s=0.0),
                     "held": JointFaults(held_after_s=0.0),
                 }
-                device._joint_faults.give(begun[self._fault], device.device_ns)
+                device.joint_faults.give(begun[self._fault], device.device_ns)
         return True
 
     def speeds(self, seconds: float) -> FloatArray:

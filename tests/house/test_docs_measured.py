@@ -48,7 +48,9 @@ def test_a_file_of_rows_says_where_it_comes_from(path: Path) -> None:
 
 
 def test_only_files_that_exist_are_excused() -> None:
-    """The list of older files names no file that is gone, and excuses a changed tree alone."""
+    """The list of older files is counted, names no file that is gone, and excuses a changed tree alone."""
+    counts = "No One Two Three Four Five Six Seven Eight Nine Ten Eleven Twelve".split()
+    assert f"[{counts[len(reported())]} older files](#older-files)" in PAGE
     assert {name for name in reported() if not (MEASURED / name).is_file()} == set()
     assert set().union(*reported().values()) == {"clean tree"}
 

@@ -86,7 +86,7 @@ ROOMS = {
         {"wire", "plant"},
         {"robots", "chips"},
         {"emulator"},
-        {"dynamixel"},
+        {"dynamixel", "fault_rows"},
     ),
     "drivers.go2": (
         {"descriptions", "wording"},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from measure_paper_update import UPDATES, measure, printed_rows
+from measure_paper_update import measure, measure_with_recording, printed_rows
 
 from deal_hw.bench import calibration
 from deal_hw.bench.settings import Paper
@@ -28,10 +28,37 @@ def test_the_noise_decides_where_the_update_ends() -> None:
     """Without noise it ends far up the range, with all of it near the lower end, where the truth is."""
     errors = {
         name: np.mean([measure(name, 11, 10.0, seed)["error_percent"] for seed in range(3)])
-        for name in UPDATES
+        for name in ("literal", "literal, eta 0", "deal-paper")
     }
     assert errors["literal"] < 100 < 300 < errors["deal-paper"]
     assert errors["literal, eta 0"] > 3 * errors["literal"]
+
+
+def test_a_box_around_zero_keeps_the_middle_of_the_range() -> None:
+    """Without data a centred box ends at 405 % of the linear midpoint at ratio 10, whatever its width."""
+    for name in ("literal, box [-1, 1]", "literal, box [-1, 1], eta 0.1", "literal, unit variance"):
+        errors = [measure(name, 11, 10.0, seed)["error_percent"] for seed in range(3)]
+        assert np.mean(errors) == pytest.approx(405, rel=0.15), name
+
+
+@pytest.mark.slow
+def test_with_a_recording_a_row_is_the_benchs_row() -> None:
+    """`literal` is the bench's method; another reading is another search on the same recording."""
+    asked = Paper(
+        profile="ideal",
+        methods=("deal-paper-literal",),
+        range_ratio=(10.0,),
+        seeds=(3,),
+        demonstration="policy",
+    )
+    (cell,) = calibration.make_cells(asked)
+    row = calibration.run_cell(cell, population=None, generations=1, threads=1)
+    found = measure_with_recording("literal", 10.0, 3, generations=1)
+    for key in ("error_percent", "heldout_nrmse_calibrated", "steps"):
+        assert found[key] == pytest.approx(row[key], rel=1e-6)
+    other = measure_with_recording("literal, clip 0.1", 10.0, 3, generations=1)
+    assert other["error_percent"] != pytest.approx(row["error_percent"], rel=1e-6)
+    assert other["pole_moved_rad"] == found["pole_moved_rad"] > 0.01
 
 
 def test_the_papers_deal_has_one_place_at_all_ratios() -> None:

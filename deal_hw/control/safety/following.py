@@ -229,9 +229,18 @@ class FollowingWatch:
             self._followed_ns,
             f"joint {self._names[worst]!r} does not follow: its set-point is {abs(off):.2f} "
             f"{self._units[worst]} away, so its drive should push with {abs(share[worst]):.0%} of its limit, "
-            "but the joint does not move that way. It is blocked, its drive is off or limp, or its reading "
-            "stands still; look at it before the next run",
+            f"but the joint does not move that way. {self._cause(worst, position)}",
         )
+
+    def _cause(self, joint: int, position: FloatArray) -> str:
+        """Return what may be the cause of a push without motion, and what to do."""
+        there = np.abs(position[:, None] - self._setpoint) < self._elsewhere
+        for other in np.flatnonzero(there[joint] & there[:, joint] & self._like[joint]):
+            return (
+                f"Its reading is at the set-point of {self._names[other]!r}, and that one's at its own: the "
+                "two are exchanged, in the order of joints, in cables or in ids"
+            )
+        return "It is blocked, its drive is off or limp, or its reading stands still; look at it before a run"
 
     def _swung(self, position: FloatArray, share: FloatArray, passed_s: float) -> BoolArray:
         """Return which joints stand although they were pushed to both sides, (A,)."""

@@ -47,8 +47,12 @@ class PassiveConfig:
             )
 
 
-def _nothing(text: str, silence_s: float) -> None:
-    return
+Progress = Callable[[str, float], None]
+"""Takes a text for the operator, and the longest time until the next call [s]."""
+
+
+def nothing(text: str, silence_s: float) -> None:
+    """Take no note."""
 
 
 def make_passive(
@@ -56,7 +60,7 @@ def make_passive(
     clock: Clock,
     config: PassiveConfig | None = None,
     *,
-    progress: Callable[[str, float], None] = _nothing,
+    progress: Progress = nothing,
 ) -> bool:
     """Send the passive command until the robot reports that its motors no longer follow commands.
 
@@ -88,9 +92,7 @@ class _Endeavour:
     _next_ns: int
     _trouble: Exception | None
 
-    def __init__(
-        self, robot: Robot, clock: Clock, config: PassiveConfig, progress: Callable[[str, float], None]
-    ) -> None:
+    def __init__(self, robot: Robot, clock: Clock, config: PassiveConfig, progress: Progress) -> None:
         self._robot, self._clock, self._config, self._progress = robot, clock, config, progress
         self._shown = 0
         self._begin_ns = self._heard_ns = clock.now_ns()

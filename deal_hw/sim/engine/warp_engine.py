@@ -49,8 +49,7 @@ UNREAD = frozenset({"body_sameframe", "bvh_aabb"})
 """Fields that speed up MuJoCo's kinematics and collisions, and MuJoCo Warp has not."""
 
 MOST_WORLDS = 16384
-"""Most worlds at once. On an H200 bare steps a second of the DEAL paper's robots rise to so many; more were
-not measured."""
+"""Most worlds at once. A choice: no rows of a GPU are kept (docs/how-to/gpu.md)."""
 
 MEMORY_SHARE = 0.7
 """Share of the device's free memory that worlds take at most."""
@@ -70,7 +69,7 @@ class WarpEngine:
         nominal: The model of names and nominal values.
         count: Members N.
         threads: Threads that derive constants.
-        device: "cuda", or "cpu" for a processor: about 60 times slower than MuJoCo, for tests.
+        device: "cuda", or "cpu" for a processor: far slower than MuJoCo, for tests.
 
     Raises:
         ConfigurationError: The model has what MuJoCo Warp lacks, there is no GPU, or members are too many.

@@ -19,8 +19,8 @@ Say: TypeAlias = Callable[[str], None]
 
 LEAST_MEMBERS = 64
 """Fewest members for which ``auto`` takes a GPU: of a search, each of which is simulated in tens of windows
-at once, or of a training, which takes one CPU core without a GPU. On an H200 a step of 256 Go2 takes 1.5 ms,
-as do 540 steps on its machine's 16 cores (docs/how-to/gpu.md)."""
+at once, or of a training, which takes one CPU core without a GPU. A choice: no rows of a GPU are kept
+(docs/how-to/gpu.md)."""
 
 _INSTEAD = "use --engine mujoco"
 
@@ -96,7 +96,7 @@ def check_gpu() -> None:
     if problem:
         raise ConfigurationError(
             f"--engine warp needs a GPU, and {problem}; look at `nvidia-smi`, or {_INSTEAD}. To try it "
-            "without one, --engine warp-cpu is about 60 times slower than mujoco"
+            "without one, --engine warp-cpu is far slower than mujoco"
         )
 
 
@@ -149,8 +149,8 @@ def choose_engine(
         return "mujoco"
     if wanted == "warp-cpu":
         say(
-            f"MuJoCo Warp simulates {what} on a CPU, about 60 times slower than mujoco; its kernels are "
-            "compiled first, for a minute"
+            f"MuJoCo Warp simulates {what} on a CPU, far slower than mujoco; its kernels are compiled first, "
+            "which takes minutes"
         )
         return "warp-cpu"
     say(f"MuJoCo Warp simulates {what} on the GPU, in float32")

@@ -137,7 +137,7 @@ class CalibrateSettings(Checked):
     """What simulates the population of a search (deal, eki, deal-paper); every fit is by mujoco, in float64.
     mujoco: all CPUs. warp: MuJoCo Warp on an NVIDIA GPU, in float32, for populations of hundreds and more
     (extra gpu). auto: warp where there is a GPU, the model can run there and the population is large enough,
-    else mujoco. warp-cpu: MuJoCo Warp without a GPU, about 60 times slower than mujoco, to try it
+    else mujoco. warp-cpu: MuJoCo Warp without a GPU, far slower than mujoco, to try it
     (docs/how-to/gpu.md)."""
 
     ray: RayPlace = None

@@ -9,20 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deal_hw.clock import MonotonicClock
+from deal_hw.control.loop.after_death import passive_after
 from deal_hw.control.loop.timing import LoopTimingReport
-from deal_hw.control.process.channel import (
-    CONNECTING,
-    HANDING_BACK,
-    HOMING,
-    LOADING,
-    MAKING_PASSIVE,
-    STARTING,
-    Beat,
-    Outcome,
-)
+from deal_hw.control.process.channel import MAKING_PASSIVE, Beat, Outcome
 from deal_hw.control.process.run_note import RunNote
 from deal_hw.control.process.supervisor import ChildEnd, Supervisor
-from deal_hw.control.safety.passive import PassiveConfig, make_passive
+from deal_hw.control.safety.passive import PassiveConfig
 from deal_hw.data.checks.following import followed_part
 from deal_hw.data.recording.excitation import Excitation
 from deal_hw.data.recording.reader import read_trajectory
@@ -197,14 +189,7 @@ class EpisodeRun:
         self, supervisor: Supervisor, phase: str, already_tried: bool, on_beat: Callable[[Beat], None]
     ) -> bool:
         """Make the robot passive if a dead control process had begun to command it."""
-        untouched = (
-            STARTING,
-            LOADING,
-            CONNECTING,
-            HANDING_BACK,
-            *(() if self._robot.homes_by_motor else (HOMING,)),
-        )
-        if self._plan.dry_run or phase in untouched:
+        if self._plan.dry_run:
             return True
         clock = MonotonicClock()
 
@@ -216,7 +201,7 @@ class EpisodeRun:
             self._say(f"not made passive after this program was stopped: {who}")
             return False
         config = _TRIED_AGAIN if already_tried else PassiveConfig(timeout_s=self._plan.passive_timeout_s)
-        return make_passive(self._robot, clock, config, progress=tell)
+        return passive_after(phase, self._robot, clock, config, tell)
 
 
 _LINK_WARNING = 0.01

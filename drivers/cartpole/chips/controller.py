@@ -95,6 +95,7 @@ class Controller:
         armings: How often the motor was armed.
         mode: State of the motor.
         watchdog: Whether the motor was stopped by missing commands since it was last armed.
+        clock_us: What the clock of its states shows at tick 0 [us].
 
     Args:
         servo: The position loop.
@@ -111,7 +112,7 @@ class Controller:
         self._unique_id = unique_id
         self._command_delay = command_delay
         self._link: Link = link or SerialLink()
-        self._tick = 0
+        self._tick = self.clock_us = 0
         self.mode = Mode.IDLE
         self._homed = self.watchdog = False
         self._last_request: tuple[int, int] | None = None
@@ -185,7 +186,7 @@ class Controller:
         known = self._command_sequence != protocol.NO_COMMAND
         return protocol.State(
             sequence=sequence,
-            device_us=tick * 1000,
+            device_us=self.clock_us + tick * 1000,
             cart_um=reading.cart_um,
             cart_um_s=reading.cart_um_s,
             pole_urad=reading.pole_urad,

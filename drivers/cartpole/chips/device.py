@@ -93,6 +93,11 @@ class EmulatedDevice(abc.ABC):
         """Current fault of its wire or its motors; "" for none."""
         return self._mechanics.joint_faults.now
 
+    @property
+    def joint_faults(self) -> FaultyJoints:
+        """Faults of the joints; may be given at any time."""
+        return self._mechanics.joint_faults
+
     def break_joints(self, faults: JointFaults) -> None:
         """Give the joints faults, whose times count from the first arming."""
         d = DESCRIPTION
@@ -135,6 +140,9 @@ class CartpoleDevice(EmulatedDevice):
     Until armed the motor is off: the pole hangs, or is held upright by a hand after homing. Between arming
     and the first target the force is zero, because gains come only with targets.
 
+    Attributes:
+        firmware: The firmware.
+
     Args:
         truth: Hidden parameters, latency, profile and seed.
         keep_truth: Whether to keep the true trajectory for :meth:`true_trajectory`.
@@ -151,31 +159,31 @@ class CartpoleDevice(EmulatedDevice):
         firmware: Callable[[CartpoleTruth, Mechanics], Firmware] = python_firmware,
     ) -> None:
         super().__init__(Mechanics(truth, start_angle_rad=start_angle_rad), keep_truth=keep_truth)
-        self._firmware = firmware(truth, self._mechanics)
+        self.firmware = firmware(truth, self._mechanics)
 
     @property
     def armed(self) -> bool:
         """Whether the motor follows targets."""
-        return self._firmware.mode is Mode.ARMED
+        return self.firmware.mode is Mode.ARMED
 
     @property
     def mode(self) -> str:
         """State of the motor: "idle" and "held" without torque, "homing" and "armed" with torque."""
-        return "held" if self._mechanics.held else self._firmware.mode.name.lower()
+        return "held" if self._mechanics.held else self.firmware.mode.name.lower()
 
     @property
     def watchdog(self) -> bool:
         """Whether the motor was stopped because no commands came, since it was last armed."""
-        return self._firmware.watchdog
+        return self.firmware.watchdog
 
     @property
     def frame_errors(self) -> int:
         """Corrupt frames received so far."""
-        return self._firmware.frame_errors
+        return self.firmware.frame_errors
 
     def tick(self) -> bytes:
         """Run one control tick; return the bytes sent in it."""
-        mechanics, firmware, out = self._mechanics, self._firmware, b""
+        mechanics, firmware, out = self._mechanics, self.firmware, b""
         motor = mechanics.motor()
         if self._inbox:
             (data, self._inbox), homings, armings = (self._inbox, b""), firmware.homings, firmware.armings

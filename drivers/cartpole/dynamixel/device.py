@@ -17,6 +17,7 @@ from deal_hw.drivers.cartpole.plant.sensor import Motor
 from deal_hw.drivers.cartpole.plant.truth import CartpoleTruth
 from deal_hw.drivers.servo_bus.emulated_bus import EmulatedBus
 from deal_hw.drivers.servo_bus.emulated_servo import EmulatedServo
+from deal_hw.drivers.servo_bus.faults import BusFaults
 from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN, WAY_TICKS, OtherMaster
 from deal_hw.drivers.servo_bus.packets import sync_write
 from deal_hw.drivers.servo_bus.registers import (
@@ -159,6 +160,21 @@ class DynamixelDevice(EmulatedDevice):
         """Restart a servo, as after a dip of its supply."""
         servo.reboot(self._now_ns)
 
+    def double(self) -> None:
+        """Plug in a second servo with the id of the belt's."""
+        self.servos.append(self._cart.twin())
+
+    def let_write(self, faults: BusFaults) -> None:
+        """Let another program write the belt servo's goals."""
+        goal = self._cart.get(GOAL_POSITION) + WAY_TICKS
+        packet = sync_write(GOAL_POSITION, {self._cart.id: goal})
+        self._other = OtherMaster(packet, self.bus, faults, self._now_ns)
+
+    def mend_bus(self) -> None:
+        """Unplug the second servo, and end the other program."""
+        self.servos[2:] = []
+        self._other = None
+
     def _advance_clock(self, now_ns: int) -> None:
         self.bus.now_ns = self._now_ns = max(self._now_ns, now_ns)
 
@@ -231,9 +247,7 @@ class DynamixelDevice(EmulatedDevice):
             self._pole.present = False
         if f.duplicate_id_after_s is not None and passed_s > f.duplicate_id_after_s:
             self._faults = f = dataclasses.replace(f, duplicate_id_after_s=None)
-            self.servos.append(self._cart.twin())
+            self.double()
         if f.foreign_writer_after_s is not None and passed_s > f.foreign_writer_after_s:
-            goal = self._cart.get(GOAL_POSITION) + WAY_TICKS
-            packet = sync_write(GOAL_POSITION, {self._cart.id: goal})
             self._faults = dataclasses.replace(f, foreign_writer_after_s=None)
-            self._other = OtherMaster(packet, self.bus, f, self._now_ns)
+            self.let_write(f)

@@ -66,6 +66,7 @@ class OdriveFirmware:
         armings: Number of armings.
         frame_errors: Number of invalid frames to the drive.
         watchdog: Whether the watchdog stopped the motor since errors were cleared.
+        encoder: Firmware of the encoder node.
 
     Args:
         truth: Hidden factors of gains and effort limit.
@@ -88,7 +89,7 @@ class OdriveFirmware:
         self._parts, self._serial = parts, serial_number.to_bytes(6, "little")
         self._law = DriveLaw(truth, parts)
         self._command_delay = command_delay
-        self._encoder = encoder
+        self.encoder = encoder
         self._mode = Mode.IDLE
         self._errors = self._disarm_reason = AxisError(0)
         self._config = self._saved = configured(parts)
@@ -102,12 +103,12 @@ class OdriveFirmware:
     @property
     def homings(self) -> int:
         """Number of homings that began."""
-        return self._encoder.homings
+        return self.encoder.homings
 
     @property
     def mode(self) -> Mode:
         """Mode of the motor, or homing."""
-        return self._mode if self._mode is Mode.ARMED else self._encoder.mode
+        return self._mode if self._mode is Mode.ARMED else self.encoder.mode
 
     @property
     def setpoint(self) -> float:
@@ -131,7 +132,7 @@ class OdriveFirmware:
                 if self._tick >= self._silent_until:
                     out += self._take(identifier, payload[: min(length, 8)], motor, remote=remote)
             elif not remote:
-                out += self._encoder.receive(frame, motor)
+                out += self.encoder.receive(frame, motor)
         return out
 
     def control(self, motor: Motor) -> tuple[float, bool]:
@@ -152,12 +153,12 @@ class OdriveFirmware:
             turns, speed = self._turns(motor.position), motor.velocity / self._parts.metres_per_turn
             most = self._config[CONTROLLER + "vel_integrator_limit"]
             self._force_n = self._law.force(self._acting, turns, speed, most)
-        self._encoder.control(motor)
+        self.encoder.control(motor)
         return self._force_n, tick % TICKS_PER_STATE == 0
 
     def report(self, reading: Reading) -> bytes:
         """Return the frames of the tick that :meth:`control` ran last."""
-        encoder = self._encoder.report(reading._replace(at_end_stop=False))
+        encoder = self.encoder.report(reading._replace(at_end_stop=False))
         if self._tick < self._silent_until or self.node == BROADCAST_NODE:
             return encoder
         parts = self._parts
@@ -172,7 +173,7 @@ class OdriveFirmware:
 
     def finish_homing(self) -> None:
         """Note that the cart is in the middle and the pole upright."""
-        self._encoder.finish_homing()
+        self.encoder.finish_homing()
 
     # The control law.
 

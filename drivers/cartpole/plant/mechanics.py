@@ -122,9 +122,10 @@ class Mechanics:
         """Return the sensors' readings: delayed, noisy and quantised as in the profile."""
         seen = self._sensor.read()._replace(at_end_stop=abs(self._now[0][_CART]) >= _END_STOP_M)
         position, velocity = self.joint_faults.read(
-            np.array((seen.cart_um, seen.pole_urad)), np.array((seen.cart_um_s, seen.pole_urad_s))
+            1e-6 * np.array((seen.cart_um, seen.pole_urad)),
+            1e-6 * np.array((seen.cart_um_s, seen.pole_urad_s)),
         )
-        cart, pole, cart_s, pole_s = (int(value) for value in (*position, *velocity))
+        cart, pole, cart_s, pole_s = (round(1e6 * value) for value in (*position, *velocity))
         return seen._replace(cart_um=cart, pole_urad=pole, cart_um_s=cart_s, pole_urad_s=pole_s)
 
     def loses_frame(self) -> bool:

@@ -97,7 +97,7 @@ class Go2Device(UnitreeDevice[LowCommand]):
         self._sim.add_payload(truth.payload_kg)
         self._sim.set_floor_friction(truth.floor_friction)
         self._motors = Motors(truth, profile)
-        self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng, self._joint_faults)
+        self._sensing = Sensing(self._sim, self._motors, truth, profile, sensor_rng, self.joint_faults)
         self._sport = SportMode(machine, sport)
         self._services = ServiceServer(self._sport)
         self.sport_on_wire = sport_on_wire
@@ -205,6 +205,16 @@ class Go2Device(UnitreeDevice[LowCommand]):
     @property
     def _own_name(self) -> str:
         return self._sport.name
+
+    def leave_own(self) -> None:
+        """Let sport mode leave the robot at once."""
+        self._sport.name = ""
+
+    def _stiff_message(self, position: FloatArray) -> bytes:
+        stiffness, damping = self._machine.stand_gains
+        mode = np.full(12, self._machine.servo_modes[0])
+        zero, ones = np.zeros(12), np.ones(12)
+        return self._encoder.encode(LowCommand(position, zero, stiffness * ones, damping * ones, zero, mode))
 
     def _update_own(self, now: int) -> None:
         self._sport.update(now)

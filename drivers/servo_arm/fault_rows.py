@@ -1,0 +1,88 @@
+"""Fault tables of arms of servos; see :mod:`deal_hw.testing.fault_rows`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from deal_hw.drivers.servo_arm.families import ON
+from deal_hw.drivers.servo_bus.faults import BusFaults
+from deal_hw.testing.fault_rows import (
+    CLOCK_AHEAD,
+    CLOCK_BACK,
+    CONTROLLER_OFF,
+    DUPLICATE,
+    EXCHANGED,
+    FOREIGN,
+    HOMING,
+    LIMP,
+    PLANNED_END,
+    FaultRig,
+    FaultRow,
+    FaultTable,
+    Lacks,
+    killed_cells,
+)
+
+_NO_CLOCK: Final = Lacks("its servos have no clock: times are this computer's")
+
+
+def is_stiff(device: Any) -> bool:
+    """Return whether a motor follows its goals; one that its own watchdog stopped holds where it is."""
+    return any(joint.torque == ON and not joint.stopped for joint in device.joints)
+
+
+def _double(rig: FaultRig) -> None:
+    rig.device.double(rig.device.joints[-1])
+
+
+def _let_write(rig: FaultRig) -> None:
+    rig.device.let_write(rig.device.joints[-1], BusFaults())
+
+
+def _mend(rig: FaultRig) -> None:
+    rig.device.mend_bus()
+
+
+def arm_rows() -> dict[str, FaultRow | Lacks]:
+    """Return the rows that differ from those of every robot."""
+    cells = killed_cells(homes_by_motor=True)
+    return {
+        CONTROLLER_OFF: Lacks("its servos are its only controllers, and a restart takes their torque"),
+        FOREIGN: FaultRow(begin=_let_write, mend=_mend, lasts_s=1.0, cells=cells),
+        DUPLICATE: FaultRow(begin=_double, mend=_mend, cells=cells),
+        CLOCK_AHEAD: _NO_CLOCK,
+        CLOCK_BACK: _NO_CLOCK,
+    }
+
+
+_START_RAD_S: Final = 0.75
+"""Homing goes at 0.5 rad/s, and the emulated drives swing about it."""
+_MAY_NOT_SHOW: Final = {
+    EXCHANGED: "two readings of this small motion hardly differ",
+    LIMP: "the motion swells: early in it the joints stay near their set-points without torque",
+}
+_PHASES: Final[Mapping[str, float | Lacks]] = {
+    HOMING: 0.01,
+    PLANNED_END: Lacks("its robot.yaml has no rest pose"),
+}
+"""It is switched on in its start pose, so homing is short."""
+
+
+FEETECH: Final = FaultTable(
+    name="arm feetech",
+    stiff=is_stiff,
+    start_speed=_START_RAD_S,
+    phases=_PHASES,
+    may_not_show=_MAY_NOT_SHOW,
+    rows=arm_rows(),
+)
+DYNAMIXEL: Final = FaultTable(
+    name="arm dynamixel",
+    stiff=is_stiff,
+    watchdog_s=0.2,
+    start_speed=_START_RAD_S,
+    phases=_PHASES,
+    may_not_show=_MAY_NOT_SHOW,
+    rows=arm_rows(),
+)

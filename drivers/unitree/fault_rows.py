@@ -1,0 +1,85 @@
+"""Rows of a fault table that Unitree's robots share."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from deal_hw.drivers.transports.topics import LOW_COMMAND
+from deal_hw.testing.fault_rows import (
+    ARMING,
+    BOTH_KILLED,
+    CLOCK_AHEAD,
+    CLOCK_BACK,
+    CONNECTING,
+    CONTROLLER_OFF,
+    DUPLICATE,
+    FOREIGN,
+    FROZEN,
+    HOMING,
+    LIMP,
+    PHASES,
+    Expected,
+    FaultRig,
+    FaultRow,
+    Lacks,
+    killed_cells,
+    returned_cells,
+)
+
+FOREIGN_S: Final = 1.0
+"""How long another program commands the robot [s]."""
+HANGING: Final = dict.fromkeys(
+    (FROZEN, LIMP), "limbs that hang free stay near the set-points of a small motion, with torque or without"
+)
+"""Faults that may not show on a stand or a crane, and why."""
+_FOREIGN_HZ: Final = 47.0
+"""No multiple of the control rate: in virtual time its commands would always come just before ours."""
+
+
+def _begin_foreign(rig: FaultRig) -> None:
+    payload = rig.device.command_aside()
+    rig.world.every(1.0 / _FOREIGN_HZ, lambda: rig.world.publish(LOW_COMMAND, payload))
+
+
+def _end_foreign(rig: FaultRig) -> None:
+    rig.world.calm()
+
+
+def _begin_own(rig: FaultRig) -> None:
+    rig.device.begin_fault("sport")
+
+
+def _end_own(rig: FaultRig) -> None:
+    rig.device.leave_own()
+
+
+def _ahead(rig: FaultRig) -> None:
+    rig.device.jump_clock(2.0)
+
+
+def _back(rig: FaultRig) -> None:
+    rig.device.jump_clock(-5.0)
+
+
+def unitree_rows() -> dict[str, FaultRow | Lacks]:
+    """Return the rows that differ from those of every robot."""
+    contested = returned_cells(homes_by_motor=False)
+    clock = killed_cells(homes_by_motor=False)
+    return {
+        CONTROLLER_OFF: FaultRow(begin=_begin_own, mend=_end_own, lasts_s=FOREIGN_S, cells=contested),
+        FOREIGN: FaultRow(begin=_begin_foreign, mend=_end_foreign, lasts_s=FOREIGN_S, cells=contested),
+        BOTH_KILLED: FaultRow(
+            cells={
+                **dict.fromkeys(PHASES, Expected(end="holds", why="nobody is left who could damp it")),
+                **dict.fromkeys((CONNECTING, HOMING, ARMING), Expected(end="untouched")),
+            }
+        ),
+        DUPLICATE: Lacks("its motors have no ids on a wire that deal-hw sees"),
+        CLOCK_AHEAD: FaultRow(begin=_ahead, cells=clock),
+        CLOCK_BACK: FaultRow(begin=_back, cells=clock),
+    }
+
+
+def is_stiff(device: Any) -> bool:
+    """Return whether an emulated robot's motors follow commands."""
+    return bool(device.stiff)
