@@ -7,8 +7,9 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from fakes.faulty_proxy import FaultyProxy, State
 from fault_rig import (
@@ -193,14 +194,51 @@ def after(option: str) -> tuple[str, ...]:
 
 
 LINK_S = (0.1, 0.5, 1.5, 3.0, 8.0)
+JOINT_FAULTS = ("limp", "held", "frozen reading", "exchanged readings", "turned reading")
+"""How an emulator's log names the faults of joints."""
+JOINT_MS = 2000.0
+"""Longest time until a run is passive whose joints do not follow (docs/explanation/safety.md) [ms]."""
 
 
-def process_cases() -> tuple[Case, ...]:
-    """Return the rows with a fault of a process; the same for every robot."""
+def joint_cases(
+    seconds: float, moments_s: tuple[float, float], *, exchanged: bool = True, again: bool = False
+) -> Iterator[Case]:
+    """Yield the rows of joints that fail in a motion that moves all of them.
+
+    Args:
+        seconds: Length of the run [s].
+        moments_s: First and last moment of the fault after the first command [s].
+        exchanged: Whether readings are exchanged or have the other sign, too.
+        again: Whether another run follows when drives are back, or joints are free.
+    """
+    common: dict[str, Any] = {
+        "motion": ("--excite", "multisine"),
+        "seconds": seconds,
+        "moments_s": moments_s,
+        "within_ms": JOINT_MS,
+    }
+    for what, option in {"drives are limp": "--limp-after-s", "joints are held": "--held-after-s"}.items():
+        yield Case(name=f"the {what} for 2 s", emulator=after(option), again=again, **common)
+    readings = {
+        "stands still": "--frozen-after-s",
+        "is exchanged with another's": "--exchanged-after-s",
+        "has the other sign": "--turned-after-s",
+    }
+    for what, option in list(readings.items())[: 3 if exchanged else 1]:
+        words = (*after(option), "--faulty-joint", "{joint}")
+        yield Case(name=f"the reading of a joint {what}", emulator=words, **common)
+
+
+def process_cases(interrupt_ms: float = 600.0) -> tuple[Case, ...]:
+    """Return the rows with a fault of a process; the same for every robot.
+
+    Args:
+        interrupt_ms: The robot must be passive within this time of Ctrl-C [ms].
+    """
     stop, kill = signal_control(signal.SIGSTOP), signal_control(signal.SIGKILL)
     connected = ANY[1:]
     return (
-        Case(name="Ctrl-C", act=signal_run(signal.SIGINT), phases=ANY, codes=(130,)),
+        Case(name="Ctrl-C", act=signal_run(signal.SIGINT), phases=ANY, codes=(130,), within_ms=interrupt_ms),
         # Without a control process only the shell's own stop acts; then the run goes on.
         Case(name="Ctrl-Z, then fg", act=suspend, phases=ANY, codes=(130, 0)),
         Case(
@@ -226,6 +264,7 @@ def process_cases() -> tuple[Case, ...]:
             codes=(130,),
             phases=(CONNECTING, TAKING_OVER, RISING, RUNNING),
             seconds=60.0,
+            within_ms=interrupt_ms,
         ),
         Case(
             name="dry run: a policy that hangs",
@@ -249,7 +288,10 @@ def process_cases() -> tuple[Case, ...]:
 
 
 def link_cases(
-    kinds: Mapping[str, Callable[[float], Callable[[Rig], None]]], cut: bool, wires: tuple[str, ...] = ()
+    kinds: Mapping[str, Callable[[float], Callable[[Rig], None]]],
+    cut: bool,
+    wires: tuple[str, ...] = (),
+    lengths_s: Sequence[float] = LINK_S,
 ) -> Iterator[Case]:
     """Yield the rows with a link that is lost for a time: at any moment, and while the run ends.
 
@@ -257,10 +299,11 @@ def link_cases(
         kinds: Fault of the link, in words with "{}" for the time, and a function from a time [s] to an act.
         cut: Whether the emulator needs the length of a cut.
         wires: Wires on which they are possible.
+        lengths_s: How long the link is lost [s].
     """
     for words, make in kinds.items():
         for when, phases in ((" as the run ends", (ENDING,)), ("", (RISING, RUNNING, LYING_DOWN))):
-            for seconds in LINK_S:
+            for seconds in lengths_s:
                 yield Case(
                     name=words.format(f"{seconds:g} s") + when,
                     act=make(seconds),
@@ -271,3 +314,16 @@ def link_cases(
                     within_ms=2500.0,
                     wires=wires,
                 )
+
+
+def network_cases(lengths_s: Sequence[float] = LINK_S) -> Iterator[Case]:
+    """Yield the rows with a link that is lost, of a robot on Zenoh and DDS.
+
+    Args:
+        lengths_s: How long the link is lost [s].
+    """
+    tcp = {"the link freezes for {}": freeze_link, "the link is reset for {}": reset_link}
+    yield from link_cases(tcp, cut=False, wires=("zenoh",), lengths_s=lengths_s)
+    yield from link_cases(
+        {"the link is cut for {}": freeze_link}, cut=True, wires=("dds",), lengths_s=lengths_s
+    )

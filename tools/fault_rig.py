@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -46,6 +46,33 @@ LATE_S, HANG_S = 0.12, 1000.0
 GOES_WRONG_AT_S = 0.4
 """Beginning of a policy's fault [s]."""
 
+AGAIN_S = 1.2
+"""Pause between the end of a fault and the next run [s]: the robot's motion of the first second is noted."""
+DEPLOY = """
+import sys
+from pathlib import Path
+from deal_hw.workflows.running.plan import RunPlan
+from deal_hw.cli.show import Terminal
+from deal_hw.workflows.running.supervised import run_episodes
+from deal_hw.errors import DealHwError
+
+robot, policy, wanted, seconds, wire, port, dataset, *dry = sys.argv[1:]
+plan = RunPlan(
+    robot=robot, transport=wire, policy=policy, velocity=wanted, seconds=float(seconds),
+    dry_run=bool(dry), home=not dry,
+)
+try:
+    code = run_episodes(
+        plan, port=port, dataset=Path(dataset), episodes=1, purpose="deploy", view=Terminal()
+    ).exit_code
+except KeyboardInterrupt:
+    code = 130
+except DealHwError as error:
+    print(f"deal-hw: error: {error}", file=sys.stderr)
+    code = 2
+sys.exit(code)
+"""
+
 Expect = Literal["goes on", "passive", "contested", "untouched", "unhomed", "stiff"]
 """Expected ends: the run finished; the robot is passive and stays so; the same while another program
 continues to command; nothing was sent; no motor was commanded; the robot holds its last command, because only
@@ -62,13 +89,18 @@ class Case:
         codes: Correct exit codes.
         act: Causes the fault; called at a random moment of a random phase. None: the emulator causes it.
         phases: Those phases.
-        emulator: Options of the emulator; "{t}" becomes a random moment after the first command [s].
+        emulator: Options of the emulator; "{t}" becomes a random moment after the first command [s],
+            "{joint}" a random joint.
         policy: "nan", "late" or "hang" for a faulty policy; "" to hold the pose.
         dry: Whether it is a dry run.
         seconds: Length of the run without standing up and lying down [s]; 0: the rig's.
         within_ms: The robot must be passive within this time of the fault, or of the link's return [ms].
         wires: The wires on which it is possible; empty: all.
         from_ms: Times count from this long after the fault [ms]: the duration of the link's loss.
+        motion: Arguments that choose the motion; empty: the rig's.
+        moments_s: First and last moment of an emulator's own fault after the first command [s]; None: the
+            rig's.
+        again: Whether another run follows on the same robot when its fault is over; it must finish.
     """
 
     name: str
@@ -83,6 +115,9 @@ class Case:
     within_ms: float = 600.0
     wires: tuple[str, ...] = ()
     from_ms: float = 0.0
+    motion: tuple[str, ...] = ()
+    moments_s: tuple[float, float] | None = None
+    again: bool = False
 
 
 class SpoiledError(Exception):
@@ -111,6 +146,10 @@ class Rig(ABC):
     active: ClassVar[frozenset[str]]
     """Entries of the emulator's log after which the motors obey."""
     inactive: ClassVar[frozenset[str]]
+    over: ClassVar[frozenset[str]] = frozenset()
+    """Entries of the emulator's log at which its own fault is over."""
+    again: ClassVar[tuple[str, ...]] = ()
+    """Arguments that choose the motion of another run after the fault."""
 
     def __init__(
         self,
@@ -124,6 +163,7 @@ class Rig(ABC):
         self.case, self.wire, self.folder, self.rng, self.slot = case, wire, folder, rng, slot
         self.typical_s = dict(typical_s or {CONNECTING: 2.0, TAKING_OVER: 0.5})
         self.fault_ns = self.start_ns = -1
+        self.end_ns: int | None = None
         self.phase = ""
         self.notes: list[str] = []
         self.events: list[tuple[int, str]] = []
@@ -158,11 +198,22 @@ class Rig(ABC):
         """Return the time of the emulator's own fault [host ns]; -1: there was none."""
         return -1
 
+    def figures(self, report: Mapping[str, Any]) -> dict[str, float]:
+        """Return further figures by name with unit; what is wrong with them goes to the notes."""
+        return {}
+
+    def states(self, report: Mapping[str, Any]) -> list[tuple[int, bool]]:
+        """Return the times at which the motors began or ceased to follow this run [host ns]."""
+        found = [(ns, what) for ns, what in self.changes(report) if what in self.active | self.inactive]
+        return [(ns, what in self.active) for ns, what in found if self.end_ns is None or ns < self.end_ns]
+
     @contextlib.contextmanager
     def emulator(self) -> Iterator[EmulatorProcess]:
         """Run the emulator."""
-        moment = f"{self.rng.uniform(0.2, self.longest_s):.3f}"
-        options = [word.replace("{t}", moment) for word in self.case.emulator]
+        moment = f"{self.rng.uniform(*(self.case.moments_s or (0.2, self.longest_s))):.3f}"
+        joint = str(self.rng.choice(self.description.actuated)) if "{joint}" in self.case.emulator else ""
+        drawn = {"{t}": moment, "{joint}": joint}
+        options = [drawn.get(word, word) for word in self.case.emulator]
         process = EmulatorProcess(
             self.robot,
             *self.emulator_options(),
@@ -202,12 +253,23 @@ class Rig(ABC):
         where = ["--port", port or self.port, "--out", str(self.folder / out)]
         return [UNDER_TEST, "-m", "deal_hw", *self.arguments(), *where, *dry]
 
-    def launch(self, out: str, port: str = "") -> subprocess.Popen[str]:
-        """Start a run in a process group of its own, as a shell with job control does."""
+    def deployment(self, seconds: float, out: str, port: str = "") -> list[str]:
+        """Return the command line of a run of the case's policy on a robot without legs.
+
+        A policy's fault begins at a commanded velocity, so that its trial does not find the fault. `deploy`
+        refuses that option for a robot without legs, so a program runs the same plan.
+        """
+        _, policy, _, wanted = self.policy_arguments()
+        where = [self.wire, port or self.port, str(self.folder / out / "dataset")]
+        dry = ["dry"] * self.case.dry
+        return [UNDER_TEST, "-c", DEPLOY, self.robot, policy, wanted, str(seconds), *where, *dry]
+
+    def launch(self, out: str, port: str = "", command: Sequence[str] = ()) -> subprocess.Popen[str]:
+        """Start a run, or another command, in a process group of its own, as a shell does."""
         (self.folder / "out").mkdir(exist_ok=True)
         with (self.folder / "out" / out).open("w") as file:
             return subprocess.Popen(
-                self.command(out, port),
+                command or self.command(out, port),
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -313,6 +375,34 @@ class Rig(ABC):
         if pid > 0:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
+
+    def run_again(self) -> None:
+        """Wait until the emulator's fault is over and some time has passed; run again: it must finish.
+
+        Raises:
+            SpoiledError: The fault never began, because the run ended before it commanded; or it never ended.
+        """
+        if not any(what in self.active for _, what in self.events):
+            raise SpoiledError(f"the run ended before it commanded: {headline(self.output)}")
+        due = time.monotonic() + PATIENCE_S
+        while not any(self.event_ns(what) for what in self.over):
+            if time.monotonic() > due:
+                raise SpoiledError("the emulator's fault did not end")
+            time.sleep(0.02)
+            self.pump()
+        time.sleep(AGAIN_S)
+        words = ["collect", self.robot, *self.again, "--transport", self.wire, "--port", self.port]
+        next_run = self.launch(
+            "again", command=[UNDER_TEST, "-m", "deal_hw", *words, "--out", str(self.folder / "again")]
+        )
+        try:
+            code = next_run.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            next_run.kill()
+            code = next_run.wait()
+        if code != 0:
+            printed = headline((self.folder / "out" / "again").read_text())
+            self.notes.append(f"the next run ended with {code}: {printed}")
 
     def finish(self) -> None:
         """Wait until the run and its children have ended; kill what hangs."""

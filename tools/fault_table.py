@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -85,6 +85,9 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         # Messages in transit must arrive.
         time.sleep(0.3)
         rig.pump()
+        if case.again:
+            rig.end_ns = time.monotonic_ns()
+            rig.run_again()
     learn(typical_s, rig)
     if not (rig.folder / "emulator.json").exists():
         raise SpoiledError("the emulator died without a report")
@@ -95,11 +98,13 @@ def _repetition(rig: Rig, typical_s: dict[str, float]) -> dict[str, Any]:
         rig.fault_ns = last_cycle_ns if case.policy else rig.by_itself(report)
         if any(word == "{t}" for word in case.emulator) and rig.fault_ns < 0 and case.expect == "passive":
             raise SpoiledError("the run ended before the emulator's fault began")
+    figures = rig.figures(report)
     return {
         "phase": rig.phase,
         "exit_code": rig.run.returncode,
         **row,
         **judge(rig, report),
+        **({"figures": figures} if figures else {}),
         "operator": headline(rig.output).replace(f"{rig.folder}/", "PORT/"),
         "notes": rig.printed,
         "complaints": complaints(rig, report, row),
@@ -137,9 +142,7 @@ def judge(rig: Rig, report: Mapping[str, Any]) -> dict[str, Any]:
 
     If another program goes on commanding, the first time that the robot was made passive counts.
     """
-    states = [
-        (ns, what in rig.active) for ns, what in rig.changes(report) if what in rig.active | rig.inactive
-    ]
+    states = rig.states(report)
     ends = "never commanded"
     if any(active for _, active in states):
         ends = "active" if states[-1][1] else "passive"
@@ -319,6 +322,7 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
         lines.append(
             f"| {name} | {known[0]['expected']} | {cells} | {codes} | {data} | {shortened(printed)} |"
         )
+    lines += figure_table(results)
     bad = []
     for row in (row for result in results for row in result["rows"]):
         if row["as_expected"] < row["count"]:
@@ -326,6 +330,23 @@ def page(title: str, words: Sequence[str], results: Sequence[Mapping[str, Any]])
             bad.append(f"- {row['wire']}, {row['fault']}: {'; '.join(why)}")
     lines += ["", "Not as expected: none." if not bad else "Not as expected:", *(["", *bad] if bad else [])]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def figure_table(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the lines of a table of further figures, median and worst of each; none where there are none."""
+    found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    for row in (row for result in results for row in result["rows"]):
+        for one in row["repetitions"]:
+            for name, value in one.get("figures", {}).items():
+                found[name, row["fault"], row["wire"]].append(value)
+    if not found:
+        return []
+    lines = [
+        f"| {name} | {fault} | {wire} | {statistics.median(values):.3g} / {max(values):.3g} | {len(values)} |"
+        for (name, fault, wire), values in sorted(found.items())
+    ]
+    heads = "| figure | fault | wire | median / worst | repetitions |"
+    return ["", heads, "|---|---|---|---:|---:|", *lines]
 
 
 def shortened(printed: str) -> str:
@@ -348,9 +369,23 @@ def cell(row: Mapping[str, Any] | None) -> str:
 
 
 def main(
-    rig_type: type[Rig], cases: Sequence[Case], title: str, words: Sequence[str], doc: str | None
+    rig_type: type[Rig],
+    cases: Sequence[Case],
+    title: str,
+    words: Sequence[str],
+    doc: str | None,
+    arguments: Sequence[str] | None = None,
 ) -> int:
-    """Run a table, or write a page; return 1 if a repetition was not as expected."""
+    """Run a table, or write a page; return 1 if a repetition was not as expected.
+
+    Args:
+        rig_type: The robot.
+        cases: The rows.
+        title: Title of the page.
+        words: What comes before the page's table.
+        doc: Description of the tool.
+        arguments: Its arguments; None: the program's.
+    """
     options = parser(doc, out=False)
     if len(rig_type.wires) > 1:
         options.add_argument("--transport", choices=rig_type.wires, default=rig_type.wires[0])
@@ -371,7 +406,7 @@ def main(
         metavar="FILE",
         help="write a page (first) from results (others), and measure nothing",
     )
-    given = options.parse_args()
+    given = options.parse_args(arguments)
     if given.table is not None:
         results = [json.loads(path.read_text(encoding="utf-8")) for path in given.table[1:]]
         given.table[0].write_text(page(title, words, results), encoding="utf-8")

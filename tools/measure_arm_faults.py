@@ -19,7 +19,17 @@ from typing import Any
 
 import numpy as np
 from arm_rig import BUSES, arm_file
-from fault_acts import LINK_S, after, freeze_link, kill_both, link_cases, process_cases, signal_run
+from fault_acts import (
+    JOINT_FAULTS,
+    LINK_S,
+    after,
+    freeze_link,
+    joint_cases,
+    kill_both,
+    link_cases,
+    process_cases,
+    signal_run,
+)
 from fault_rig import ANY, ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
 from fault_table import main
 
@@ -35,7 +45,7 @@ from deal_hw.sim.robots.robot_file import write_robot_file
 
 SECONDS = 1.5
 ARMED, IDLE, BRAKING, PARTLY, STOPPED = "armed", "idle", "braking", "partly", "stopped"
-BY_ITSELF = ("gone", "cut", "frozen", *TROUBLES, DOUBLED, FOREIGN)
+BY_ITSELF = ("gone", "cut", "frozen", *TROUBLES, DOUBLED, FOREIGN, *JOINT_FAULTS)
 OF_ONE_SERVO = ("--servo", "--duplicate-id", "--foreign-writer")
 """Beginnings of the emulator's options for faults of one servo."""
 DYNAMIXEL, FEETECH = ("dynamixel",), ("feetech",)
@@ -80,8 +90,9 @@ class ArmRig(Rig):
         return ["--profile", "sensor", "--nominal", "--link", str(self.folder / "port"), *faulty]
 
     def arguments(self) -> list[str]:
-        """Play a chirp."""
-        return ["collect", self.robot, "--motion", "chirp", "--seconds", str(self._seconds)]
+        """Play the motion."""
+        motion = self.case.motion or ("--motion", "chirp")
+        return ["collect", self.robot, *motion, "--seconds", str(self._seconds)]
 
     @property
     def _seconds(self) -> float:
@@ -144,13 +155,18 @@ def read_beside(rig: Rig) -> None:
             clock.sleep_until_ns(due_ns)
 
 
+LOWERED_MS = 4000.0
+"""At Ctrl-C the arm goes first to where it was found, at homing's speed; then its motors are off [ms]."""
+JOINT_S, IN_MOTION_S = 8.0, (2.3, 4.3)
+"""Length of a run with a fault of its joints, and when that begins after the first torque [s]."""
 _BOTH = "both processes are killed (SIGKILL); "
 CASES = (
     Case(name="none", expect="goes on", codes=(0,)),
+    *joint_cases(JOINT_S, IN_MOTION_S),
     *(
         # Servos answer only requests: without any, a dry run cannot see them.
         case
-        for case in process_cases()
+        for case in process_cases(LOWERED_MS)
         if not case.dry and not case.policy
     ),
     Case(
@@ -224,9 +240,10 @@ WORDS = (
     "`tools/measure_arm_faults.py` measured it on an emulated arm of two joints, profile `sensor`, over a",
     "pseudo-terminal: Dynamixel servos, whose passive state is no torque, and Feetech servos, which brake.",
     "Each repetition draws a random moment of a random phase (connecting, moving to the start pose, arming,",
-    "running, ending). A fault that comes after a run has made the motors passive leaves its exit code 0.",
-    "Feetech servos have no watchdog: where both processes are killed, they hold their last goal. Which",
-    "servo fails is drawn, too; an unplugged one has no supply. An empty cell was not measured.",
+    "running, ending); joints and their readings fail in a multisine, in which all joints move. At Ctrl-C",
+    "the arm is lowered first. A fault that comes after a run has made the motors passive leaves its exit",
+    "code 0. Feetech servos have no watchdog: where both processes are killed, they hold their last goal.",
+    "Which servo fails is drawn, too; an unplugged one has no supply. An empty cell was not measured.",
     "",
 )
 

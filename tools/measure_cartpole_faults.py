@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fault_acts import LINK_S, after, freeze_link, kill_both, link_cases, process_cases
-from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, UNDER_TEST, Case, Rig
+from fault_rig import ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
 from fault_table import main
 
 from deal_hw.drivers.cartpole.description import DESCRIPTION
@@ -35,30 +35,6 @@ CAN = ("can", "odrive")
 DYNAMIXEL = ("dynamixel",)
 STOPPED = "stopped"
 """State of a servo that its own watchdog stopped: it holds its position with torque."""
-DEPLOY = """
-import sys
-from pathlib import Path
-from deal_hw.workflows.running.plan import RunPlan
-from deal_hw.cli.show import Terminal
-from deal_hw.workflows.running.supervised import run_episodes
-from deal_hw.errors import DealHwError
-
-policy, wanted, seconds, wire, port, dataset, *dry = sys.argv[1:]
-plan = RunPlan(
-    robot="cartpole", transport=wire, policy=policy, velocity=wanted, seconds=float(seconds),
-    dry_run=bool(dry), home=not dry,
-)
-try:
-    code = run_episodes(
-        plan, port=port, dataset=Path(dataset), episodes=1, purpose="deploy", view=Terminal()
-    ).exit_code
-except KeyboardInterrupt:
-    code = 130
-except DealHwError as error:
-    print(f"deal-hw: error: {error}", file=sys.stderr)
-    code = 2
-sys.exit(code)
-"""
 
 
 class CartpoleRig(Rig):
@@ -83,17 +59,10 @@ class CartpoleRig(Rig):
         return ["collect", "cartpole", "--transport", self.wire, *motion]
 
     def command(self, out: str, port: str = "") -> list[str]:
-        """Return the command line of a run.
-
-        A policy's fault begins at a commanded velocity, so that its trial does not find the fault. `deploy`
-        refuses that option for a robot without legs, so a program runs the same plan.
-        """
-        if not (self.case.policy or self.case.dry):
-            return super().command(out, port)
-        _, policy, _, wanted = self.policy_arguments()
-        where = [self.wire, port or self.port, str(self.folder / out / "dataset")]
-        dry = ["dry"] * self.case.dry
-        return [UNDER_TEST, "-c", DEPLOY, policy, wanted, str(self._seconds), *where, *dry]
+        """Return the command line of a run; a policy runs by a program of its own."""
+        if self.case.policy or self.case.dry:
+            return self.deployment(self._seconds, out, port)
+        return super().command(out, port)
 
     @property
     def _seconds(self) -> float:

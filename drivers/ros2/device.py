@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from deal_hw.description import RobotDescription
+from deal_hw.drivers.ros2.command_log import HOLDS, MOVES, Event, Ros2CommandLog
 from deal_hw.drivers.ros2.faults import ControllerFaults
 from deal_hw.drivers.ros2.messages import (
     ACTIVE,
@@ -61,8 +62,8 @@ class Ros2Device:
         active: Whether the controller is active; an inactive one receives commands and ignores them.
         joint_faults: Faults of the joints; may be given at any time.
         host_origin_ns: Host clock at device time 0, for the log [ns].
-        changes: What happened: device time [ms], host time [ns] and the event. "moves" and "holds" say
-            whether the newest two commands differ.
+        changes: What happened: device time [ms], host time [ns] and the event; those of commands are of
+            :mod:`deal_hw.drivers.ros2.command_log`.
         accepted: Commands that the controller took.
         refused: Commands that it could not use.
 
@@ -97,6 +98,7 @@ class Ros2Device:
         self.changes: list[tuple[int, int, str]] = []
         self.accepted = self.refused = self.sent = 0
         self._last_refusal = ""
+        self._log = Ros2CommandLog()
         self._description, self._section, self._truth = d, section, truth
         self._topics = topics_of(section)
         self._actuated = np.array(d.actuated_index)
@@ -124,8 +126,6 @@ class Ros2Device:
         self._frozen = False
         self._freeze_tick: int | None = None
         self._coming: deque[tuple[int, FloatArray, int]] = deque()
-        self._newest: FloatArray | None = None
-        self._commanded = ""
         self.place(np.array(d.default_position))
 
     def place(self, position: FloatArray) -> None:
@@ -154,19 +154,16 @@ class Ros2Device:
             self.refused += 1
             self._last_refusal = str(error)
             return
+        host_ns = stamp_ns or self.host_origin_ns + self.device_ns
+        at = self._batch.position[0][self._actuated]
+        for event in self._log.take(self.device_ns, host_ns, target, at):
+            self._enter(event)
         if not self.active:
             return
         self.accepted += 1
         if self.accepted == 1:
-            self._note("first command", stamp_ns)
             self._first_ns = self.device_ns
             self.joint_faults.begin(self.device_ns)
-        if self._newest is not None:
-            commanded = "holds" if np.array_equal(target, self._newest) else "moves"
-            if commanded != self._commanded:
-                self._note(commanded, stamp_ns)
-                self._commanded = commanded
-        self._newest = target
         due = math.ceil((self.device_ns + self._latency_ns) / self._tick_ns - 1e-6)
         # The controller reads commands at the manager's updates.
         due = -(-due // self._stride) * self._stride
@@ -189,16 +186,18 @@ class Ros2Device:
                 self._move = _Move(self.setpoint, target, self._tick, self._tick + ticks)
             out = [*self._activity(), *self._states()]
         if (event := self.joint_faults.advance(self.device_ns)) is not None:
-            self._note(event or "sound", 0)
+            self._note(event or "sound")
         if self.joint_faults.limp != self._limp:
             self._drive(limp=self.joint_faults.limp)
         before = self._batch.position.copy()
         self._batch.advance(self.setpoint[None, None])
         if self.joint_faults.held:
             self._batch.set_state(before, np.zeros_like(before))
+        self._log.move(self.device_ns, self._batch.velocity[0][self._actuated])
         self._tick += 1
-        if self._freeze_tick is not None and self._tick >= self._freeze_tick:
+        if not self._frozen and self._freeze_tick is not None and self._tick >= self._freeze_tick:
             self._frozen = True
+            self._note("frozen")
         return [] if self._is_cut else out
 
     def _switch(self) -> None:
@@ -223,7 +222,7 @@ class Ros2Device:
     def switch(self, *, active: bool) -> None:
         """Activate the controller, or deactivate it: then the drives hold their set-points."""
         self.active = active
-        self._note("controller active" if active else "controller off", 0)
+        self._note("controller active" if active else "controller off")
         if active and self._section.command == "trajectory":
             # A joint trajectory controller holds the pose in which it is activated.
             at = self._batch.position[0][self._actuated].copy()
@@ -249,7 +248,7 @@ class Ros2Device:
     def cut(self, seconds: float) -> None:
         """Let nothing pass in either direction for a while [s]."""
         self._cut_end = self._tick + round(seconds * 1e9 / self._tick_ns)
-        self._note(f"cut for {seconds:g} s", 0)
+        self._note(f"cut for {seconds:g} s")
 
     def freeze(self, after_s: float) -> None:
         """Stop the controller_manager after a time [s]; the drives hold their set-point."""
@@ -267,6 +266,7 @@ class Ros2Device:
                 name: getattr(self._faults, name) for name in ("corrupted", "dropped", "duplicated")
             },
             "changes": [list(change) for change in self.changes],
+            **self._log.to_json(),
         }
 
     @property
@@ -281,9 +281,13 @@ class Ros2Device:
             share * np.array(d.stiffness), share * np.array(d.damping), np.array(d.effort_limit)
         )
 
-    def _note(self, event: str, stamp_ns: int) -> None:
-        stamp_ns = stamp_ns or self.host_origin_ns + self.device_ns
-        self.changes.append((self.device_ns // 1_000_000, stamp_ns, event))
+    def _note(self, event: str) -> None:
+        self._enter((self.device_ns // 1_000_000, self.host_origin_ns + self.device_ns, event))
+
+    def _enter(self, event: Event) -> None:
+        self.changes.append(event)
+        if event[2] not in (MOVES, HOLDS):
+            self._log.watch(self.device_ns, event[1], event[2])
 
     def _decode(self, payload: bytes) -> tuple[FloatArray, float]:
         """Return a command's targets in the order of the actuated joints, (A,), and its time [s]."""

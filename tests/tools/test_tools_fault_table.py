@@ -12,6 +12,9 @@ from fault_rig import ENDING, RUNNING, Case, SpoiledError
 from fault_table import complaints, page
 from measure_arm_faults import ARMED, IDLE, ArmRig
 from measure_go2_faults import Go2Rig
+from measure_ros2_faults import FOREIGN, Ros2Rig
+
+from deal_hw.drivers.ros2.command_log import AGAIN
 
 pytestmark = pytest.mark.real_time
 
@@ -80,3 +83,35 @@ def test_a_fault_after_the_end_leaves_the_exit_code(
     rig.phase, rig.fault_ns, rig.run = phase, fault_ns, argparse.Namespace(returncode=0)  # type: ignore[assignment]
     report = {"changes": [[0, 100, ARMED], [0, 200, IDLE]]}
     assert complaints(rig, report, {"dataset": "whole"}) == ([] if fine else ["exit code 0"])
+
+
+def test_no_run_follows_a_run_that_never_commanded(tmp_path: Path) -> None:
+    """The emulator's fault begins after the first command: it would be awaited in vain."""
+    rig = ArmRig(Case(name="x", again=True), "dynamixel", tmp_path, np.random.default_rng(0))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run").write_text("deal-hw: error: no states\n")
+    rig.events = [(1, "sound")]
+    with pytest.raises(SpoiledError, match="ended before it commanded: deal-hw: error: no states"):
+        rig.run_again()
+
+
+def test_speeds_and_the_held_pose_are_judged(tmp_path: Path) -> None:
+    """A run that holds a pose far from the joints, or begins faster than homing, is not as expected."""
+    rig = Ros2Rig(Case(name="x", again=True), "dds", tmp_path, np.random.default_rng(0))
+    rig.fault_ns, rig.end_ns = 100, 400
+    report: dict[str, Any] = {
+        "commands": [
+            [90, [0.1, 0.0], 0.01],
+            [110, [0.2, 0.0], 0.02],
+            [120, [0.2, 0.0], 0.03],
+            [130, list(FOREIGN), 2.0],
+            [500, [0.2, 0.0], 0.9],
+        ],
+        "fastest_after": [[0, 90, "first command", 0.4], [0, 500, AGAIN, 0.8], [0, 300, "sound", 3.0]],
+    }
+    assert rig.states(report) == [(110, True), (110, False)]
+    assert set(rig.figures(report).values()) == {0.02, 0.4, 0.8, 3.0}
+    assert rig.notes == ["the next run begins at 0.80 rad/s"]
+    report["commands"][1][2] = 0.4
+    rig.figures(report)
+    assert "it holds a pose 0.40 rad away" in rig.notes
