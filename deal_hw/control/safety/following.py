@@ -50,8 +50,8 @@ STUCK: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.005, "m": 0.001})
 LEAST_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.2, "m": 0.04})
 """No drive reaches its limit at a smaller error: a model's stiffness is often far above the real one."""
 MOST_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.6, "m": 0.12})
-"""A soft drive that stays so far behind its set-point counts as one at its limit, which is further away: a B2 on
-a stand that is limp hangs 0.8 rad from its set-points, with a quarter of its limit."""
+"""A soft drive that stays so far behind its set-point counts as one at its limit, which is further away. A B2
+on a stand whose drives are limp is 0.4 to 0.8 rad behind, with a third of its limit."""
 UNKNOWN_REACH: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.5, "m": 0.1})
 """The same of a drive whose effort limit is unknown."""
 MOVED: Final[Mapping[str, float]] = MappingProxyType({"rad": 0.02, "m": 0.004})
