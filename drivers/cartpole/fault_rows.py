@@ -58,6 +58,9 @@ def is_stiff(device: Any) -> bool:
 
 
 _PARTS: Final = OdriveSettings()
+_HOMING_M_S: Final = 1.0
+"""A second homing counts as a command of servos that a hand has let go: 0.4 m/s by the settings, and 1.0 of
+the emulated servo, whose limits are drawn."""
 _START_M_S: Final = 0.3
 """A run that holds the cart begins where it is."""
 
@@ -123,14 +126,14 @@ def _table(wire: str, rows: Mapping[str, FaultRow | Lacks], **more: Any) -> Faul
         CLOCK_AHEAD: FaultRow(begin=_jump(2.0), cells=_CLOCK_CELLS),
         CLOCK_BACK: FaultRow(begin=_jump(-5.0), cells=_CLOCK_CELLS),
     }
+    usual = {"start_speed": _START_M_S, **more}
     return FaultTable(
         name=f"cartpole {wire}",
         stiff=is_stiff,
         watchdog_s=WATCHDOG_S,
-        start_speed=_START_M_S,
         phases=_PHASES,
         rows={**common, **rows},
-        **more,
+        **usual,
     )
 
 
@@ -195,4 +198,5 @@ DYNAMIXEL: Final = _table(
         CLOCK_AHEAD: Lacks("a servo's clock of 16 bits can only begin anew, with the servo"),
         CLOCK_BACK: FaultRow(begin=_restart, cells=_KILLED),
     },
+    start_speed=_HOMING_M_S,
 )

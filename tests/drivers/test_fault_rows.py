@@ -82,6 +82,7 @@ class TestCartpoleCan(FleetFaults):
 class TestCartpoleOdrive(FleetFaults):
     table = cartpole.ODRIVE
     quick = (CUT,)
+    tried = True
 
 
 class TestCartpoleDynamixel(FleetFaults):
