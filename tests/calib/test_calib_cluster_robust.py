@@ -113,7 +113,7 @@ def _space(K: int) -> ParameterSpace:
             name=f"p{k}",
             kind="body_mass",
             elements=("b",),
-            unit="kg",
+            unit="rad",
             nominal=0.0,
             low=-50.0,
             high=50.0,

@@ -117,7 +117,8 @@ def test_intervals_hold_what_other_models_say() -> None:
     assert list(added.values()) == pytest.approx(np.where(seen, np.sqrt(0.02), 0.0))
     moved = known.space.from_scale(known.space.to_scale(known.theta) + shift[:K])
     assert (held.interval[seen, 0] <= moved[seen]).all() and (moved[seen] <= held.interval[seen, 1]).all()
-    assert held.latency_reach_s(fit.latency_s) >= min(known.latency_reach_s(fit.latency_s) + 0.001, 0.04)
+    reach_s = min(known.latency_reach_s(fit.latency_s) + 0.001, 0.04)
+    assert held.latency_reach_s(fit.latency_s) >= reach_s - 1e-12
     # Beside a model that says the same, a third is not enough for 90 %: the farthest one is held.
     third, _ = hold_alike(problem, known, fit.latency_s, [shift, 0 * shift])
     assert (third.interval[seen, 0] <= moved[seen] * (1 + 1e-9)).all()

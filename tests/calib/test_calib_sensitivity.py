@@ -88,7 +88,7 @@ def test_parameters_are_told_apart_by_what_they_change(robot: RobotModel) -> Non
 
 def test_heldout_errors_are_in_metres(robot: RobotModel) -> None:
     """At rest a prediction that never moves is right; one that follows the command is off by less than it."""
-    space = ParameterSpace([Parameter.around("gain", "servo_stiffness", ("drive",), "N/m", 50.0, ratio=1e9)])
+    space = ParameterSpace([Parameter.around("gain", "servo_stiffness", ("drive",), "N/m", 50.0, ratio=1e8)])
     candidates = {"model": (np.array([50.0]), 0.0), "slack": (np.array([1e-7]), 0.0)}
     held_out = HeldOut(robot, space, [steps_of(robot)], window_s=0.5, threads=1)
     found = held_out.errors(candidates)

@@ -23,8 +23,8 @@ from deal_hw.drivers.transports import zenoh_session
 from deal_hw.drivers.transports.zenoh_transport import ZenohTransport
 from deal_hw.errors import ConfigurationError, PortNotFoundError, SafetyError, TransportTimeoutError
 from deal_hw.types import JointCommand
-from deal_hw.workflows import stop as stop_workflow
 from deal_hw.workflows.stop import StopReport
+from deal_hw.workflows.stopping import robot as stopping
 
 IMPATIENT = {"connect/timeout_ms": 500}
 """Setting of a session that never comes, so that nobody waits long for it."""
@@ -212,7 +212,7 @@ def test_stop_damps_through_the_bridge_and_fights_nobody(
     rig: BridgeRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the bridge damps is passive, also for an observer. Where another one controls, nothing is sent."""
-    monkeypatch.setattr(stop_workflow, "FREE_S", 0.5)
+    monkeypatch.setattr(stopping, "FREE_S", 0.5)
 
     def stop(name: str) -> StopReport:
         return deal_hw.stop("go2", port=rig.port, transport="zenoh", wire=rig.options(name), seconds=0.5)
