@@ -71,6 +71,18 @@ FINE_AT_ZERO = {
     "tx_full_after_s",
     "tx_full_s",
     "lost_node_after_s",
+    "limp_after_s",
+    "limp_s",
+    "held_after_s",
+    "held_s",
+    "frozen_after_s",
+    "exchanged_after_s",
+    "turned_after_s",
+    "out_of_range_after_s",
+    "controller_off_after_s",
+    "controller_off_s",
+    "duplicate_id_after_s",
+    "foreign_writer_after_s",
     "servo_reboot_after_s",
     "servo_overload_after_s",
     "servo_absent_after_s",
@@ -105,7 +117,7 @@ def numeric_fields() -> list[tuple[type[Any], str, Any]]:
         module = importlib.import_module(verb.module)
         for settings in dataclasses_of(getattr(module, verb.config)):
             for name, hint in typing.get_type_hints(settings).items():
-                if "float" in str(hint) or "int" in str(hint).replace("print", ""):
+                if "float" in str(hint) or "int" in re.sub("print|[Jj]oint", "", str(hint)):
                     found[settings.__name__, name] = (settings, name, hint)
     return list(found.values())
 
