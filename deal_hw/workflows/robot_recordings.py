@@ -60,10 +60,11 @@ def _check_joints(robot: UserRobot, table: Table) -> None:
         ("commands", table.actuated, driven),
     ):
         if has != wants:
+            needed = f"those of {', '.join(wants)}" if wants else "none"
             else_policy = "" if has else ", or give the policy that moved the robot (--policy FILE.onnx)"
             raise ConfigurationError(
                 f"{table.name} has {what} of {', '.join(has) or 'no joint'}, but robot {robot.file.name!r} "
-                f"needs those of {', '.join(wants)}; name the columns in a column map (--columns, in Python "
+                f"needs {needed}; name the columns in a column map (--columns, in Python "
                 f"columns=){else_policy}"
             )
 
