@@ -77,7 +77,7 @@ def robot(tmp_path: Path) -> RobotModel:
             **{
                 name: getattr(DESCRIPTION.limits, name) * (2 // len(getattr(DESCRIPTION.limits, name)))
                 for name in (f.name for f in dataclasses.fields(DESCRIPTION.limits))
-                if isinstance(getattr(DESCRIPTION.limits, name), tuple)
+                if isinstance(getattr(DESCRIPTION.limits, name), tuple) and getattr(DESCRIPTION.limits, name)
             },
         ),
     )
