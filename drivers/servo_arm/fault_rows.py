@@ -16,7 +16,6 @@ from deal_hw.testing.fault_rows import (
     FOREIGN,
     HOMING,
     LIMP,
-    PLANNED_END,
     FaultRig,
     FaultRow,
     FaultTable,
@@ -62,10 +61,7 @@ _MAY_NOT_SHOW: Final = {
     EXCHANGED: "two readings of this small motion hardly differ",
     LIMP: "the motion swells: early in it the joints stay near their set-points without torque",
 }
-_PHASES: Final[Mapping[str, float | Lacks]] = {
-    HOMING: 0.01,
-    PLANNED_END: Lacks("its robot.yaml has no rest pose"),
-}
+_PHASES: Final[Mapping[str, float | Lacks]] = {HOMING: 0.01}
 """It is switched on in its start pose, so homing is short."""
 
 
