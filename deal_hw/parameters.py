@@ -380,19 +380,21 @@ class ParameterSpace:
         for name in sorted(given.difference(self.names)):
             raise UnknownNameError(f"parameter of {what}", name, self.names)
 
-    def check_value(self, what: str, name: str, value: float) -> None:
+    def check_value(self, what: str, name: str, value: float, beyond: float = 0.0) -> None:
         """Check that a value in a file is one that a search or a training can have had.
 
         Args:
             what: The field, for the message.
             name: The parameter.
             value: Its value.
+            beyond: How far it may lie outside of the range, in widths of it: intervals that hold the
+                estimates of two halves do.
 
         Raises:
             ConfigurationError: It lies outside the parameter's range.
         """
         p = self[name]
-        slack = _ROUNDING * (p.high - p.low)
+        slack = (_ROUNDING + beyond) * (p.high - p.low)
         if not (p.low - slack <= value <= p.high + slack) or (p.scale == "log" and value <= 0):
             raise ConfigurationError(
                 f"field {what} is {value:g} {p.unit}; allowed: {p.low:g} to {p.high:g}, the range of {name!r}"

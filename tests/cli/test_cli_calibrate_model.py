@@ -184,7 +184,7 @@ def test_spikes_do_not_move_the_estimate(
         assert main([*words, "--holdout", str(folder / "other.csv")]) == EXIT_OK
         found[name] = json.loads((tmp_path / name / "calibration" / "result.json").read_text())
     reported = capsys.readouterr().err
-    assert reported.count("spikes") == 1 and "spiked.csv: warn spikes: 4 samples" in reported
+    assert reported.count("warn spikes") == 1 and "spiked.csv: warn spikes: 4 samples" in reported
     assert (
         "shoulder +3 rad at 1.400 s, shoulder -2.49 rad at 3.000 s (2 samples), elbow +4 rad at 4.0"
         in reported
