@@ -330,7 +330,7 @@ class _Row:
         space.check_value(f"{what}.estimate", name, self.estimate)
         for end, value in (("low", self.low), ("high", self.high)):
             if value is not None:
-                space.check_value(f"{what}.{end}", name, value, beyond=1.0)
+                space.check_value(f"{what}.{end}", name, value, end=True)
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ConfigurationError(
                 f"fields {what}.low and {what}.high are {self.low:g} and {self.high:g}; the lower one comes "

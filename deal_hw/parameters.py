@@ -380,24 +380,30 @@ class ParameterSpace:
         for name in sorted(given.difference(self.names)):
             raise UnknownNameError(f"parameter of {what}", name, self.names)
 
-    def check_value(self, what: str, name: str, value: float, beyond: float = 0.0) -> None:
+    def check_value(self, what: str, name: str, value: float, *, end: bool = False) -> None:
         """Check that a value in a file is one that a search or a training can have had.
 
         Args:
             what: The field, for the message.
             name: The parameter.
             value: Its value.
-            beyond: How far it may lie outside of the range, in widths of it: intervals that hold the
-                estimates of two halves do.
+            end: Whether it is an end of an interval, which a common factor of several values may move beyond
+                the range.
 
         Raises:
             ConfigurationError: It lies outside the parameter's range.
         """
         p = self[name]
-        slack = (_ROUNDING + beyond) * (p.high - p.low)
-        if not (p.low - slack <= value <= p.high + slack) or (p.scale == "log" and value <= 0):
+        width, log, around = p.high - p.low, p.scale == "log", ""
+        low, high = p.low, p.high
+        if end:
+            low, high = max(low - width, 0.0 if log else -np.inf), high + width
+            around = ", and its width to either side"
+        slack = _ROUNDING * width
+        if not (low - slack <= value <= high + slack) or (log and value <= 0):
             raise ConfigurationError(
-                f"field {what} is {value:g} {p.unit}; allowed: {p.low:g} to {p.high:g}, the range of {name!r}"
+                f"field {what} is {value:g} {p.unit}; allowed: {low:g} to {high:g}, the range of "
+                f"{name!r}{around}"
             )
 
     def to_json(self) -> list[dict[str, Any]]:
