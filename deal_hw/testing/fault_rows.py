@@ -59,7 +59,7 @@ WHOLE_S: Final = 12.0
 CUT_S: Final = 1.5
 """How long a cable is cut [s]: longer than arming waits for a state."""
 
-End = Literal["passive", "passive or over", "untouched", "untouched or over", "goes on", "holds"]
+End = Literal["passive", "passive or over", "untouched", "goes on", "holds"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -398,10 +398,10 @@ def complaints(found: FaultEvidence, phase: str, cell: Expected, table: FaultTab
     over = found.outcome == "finished"
     untouched = found.first_ns < 0
     match cell.end:
-        case "untouched" | "untouched or over":
-            if not untouched and not (over and cell.end == "untouched or over"):
+        case "untouched":
+            if not untouched:
                 wrong.append("the drives followed commands")
-            if over and cell.end == "untouched":
+            if over:
                 wrong.append("the run finished")
         case "goes on":
             if not over:
@@ -413,7 +413,7 @@ def complaints(found: FaultEvidence, phase: str, cell: Expected, table: FaultTab
             if over and cell.end == "passive":
                 wrong.append("the run finished")
             wrong += _late(found, cell)
-    if cell.end in ("goes on", "untouched or over") and found.last_ns > found.end_ns - AFTER_S * 0.5e9:
+    if cell.end == "goes on" and found.last_ns > found.end_ns - AFTER_S * 0.5e9:
         wrong.append("the drives still follow commands after the run")
     if cell.end.startswith("passive"):
         if not over and found.after_return > _FASTER * table.start_speed:

@@ -67,22 +67,6 @@ class Wire(Protocol):
         ...
 
 
-class TopicWire(Wire, Protocol):
-    """The same of a virtual wire with topics."""
-
-    def declare(self, *, publish: Collection[str] = (), subscribe: Collection[str] = ()) -> None:
-        """Declare topics."""
-        ...
-
-    def publish(self, topic: str, payload: bytes) -> None:
-        """Let another program publish a message."""
-        ...
-
-    def ends(self, topic: str) -> tuple[TopicEnd, ...] | None:
-        """Return the other programs on a topic."""
-        ...
-
-
 class World:
     """A device, its wire, and what happens at given times.
 

@@ -4,16 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from deal_hw.drivers.unitree.fault_rows import HANGING, is_stiff, unitree_rows
-from deal_hw.testing.fault_rows import PLANNED_END, FaultTable, Lacks
+from deal_hw.drivers.unitree.fault_rows import ON_CRANE, unitree_table
 
-H1: Final = FaultTable(
-    name="h1",
-    stiff=is_stiff,
-    homes_by_motor=False,
-    start_speed=3.0,
-    joint="left_knee_joint",
-    phases={PLANNED_END: Lacks("it hangs on a crane: its limbs are damped when the run is over")},
-    may_not_show=HANGING,
-    rows=unitree_rows(),
-)
+H1: Final = unitree_table("h1", "left_knee_joint", ON_CRANE)

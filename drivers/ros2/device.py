@@ -189,10 +189,10 @@ class Ros2Device:
             self._note(event or "sound")
         if self.joint_faults.limp != self._limp:
             self._drive(limp=self.joint_faults.limp)
-        before = self._batch.position.copy()
+        held = self._batch.position.copy() if self.joint_faults.held else None
         self._batch.advance(self.setpoint[None, None])
-        if self.joint_faults.held:
-            self._batch.set_state(before, np.zeros_like(before))
+        if held is not None:
+            self._batch.set_state(held, np.zeros_like(held))
         self._log.move(self.device_ns, self._batch.velocity[0][self._actuated])
         self._tick += 1
         if not self._frozen and self._freeze_tick is not None and self._tick >= self._freeze_tick:

@@ -265,10 +265,10 @@ class ArmDevice:
         if self._stale:
             self._command()
             self._stale = False
-        before = self._batch.position.copy()
+        held = self._batch.position.copy() if self.joint_faults.held else None
         self._batch.advance(self._setpoint[None, None, self._actuated])
-        if self.joint_faults.held:
-            self._batch.set_state(before, np.zeros_like(before))
+        if held is not None:
+            self._batch.set_state(held, np.zeros_like(held))
         self._hold()
         self._take_state()
         self._tick += 1

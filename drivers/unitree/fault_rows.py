@@ -17,9 +17,11 @@ from deal_hw.testing.fault_rows import (
     FROZEN,
     HOMING,
     PHASES,
+    PLANNED_END,
     Expected,
     FaultRig,
     FaultRow,
+    FaultTable,
     Lacks,
     killed_cells,
     returned_cells,
@@ -27,7 +29,11 @@ from deal_hw.testing.fault_rows import (
 
 FOREIGN_S: Final = 1.0
 """How long another program commands the robot [s]."""
-HANGING: Final = {FROZEN: "limbs that hang free stay near the set-points of a small motion"}
+ON_STAND: Final = "on a stand it has no way to go: its legs hang when the run is over"
+"""Why a legged robot on a stand has no planned end."""
+ON_CRANE: Final = "it hangs on a crane: its limbs are damped when the run is over"
+"""The same of a humanoid."""
+_HANGING: Final = {FROZEN: "limbs that hang free stay near the set-points of a small motion"}
 """What may not show on a stand or a crane, and why."""
 _FOREIGN_HZ: Final = 47.0
 """No multiple of the control rate: in virtual time its commands would always come just before ours."""
@@ -75,6 +81,26 @@ def unitree_rows() -> dict[str, FaultRow | Lacks]:
         CLOCK_AHEAD: FaultRow(begin=_ahead, cells=clock),
         CLOCK_BACK: FaultRow(begin=_back, cells=clock),
     }
+
+
+def unitree_table(name: str, joint: str, hangs: str = "") -> FaultTable:
+    """Return the fault table of a robot.
+
+    Args:
+        name: The robot.
+        joint: The joint whose reading is wrong.
+        hangs: Why it has no planned end, where its limbs hang in the air; "": it stands on the floor.
+    """
+    return FaultTable(
+        name=name,
+        stiff=is_stiff,
+        homes_by_motor=False,
+        start_speed=3.0,
+        joint=joint,
+        phases={PLANNED_END: Lacks(hangs)} if hangs else {},
+        may_not_show=_HANGING if hangs else {},
+        rows=unitree_rows(),
+    )
 
 
 def is_stiff(device: Any) -> bool:
