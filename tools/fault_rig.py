@@ -23,6 +23,8 @@ from fakes.faulty_proxy import FaultyProxy
 from deal_hw.description import RobotDescription
 from deal_hw.policies.onnx_export import write_policy
 from deal_hw.policies.onnx_runtime import OnnxPolicy
+from deal_hw.sim.robots.file_description import file_description
+from deal_hw.sim.robots.robot_file import RobotFile
 from deal_hw.workflows.emulation.process import EmulatorProcess
 
 UNDER_TEST = os.environ.get("DEAL_HW_PYTHON", sys.executable)
@@ -150,6 +152,10 @@ class Rig(ABC):
     """Entries of the emulator's log at which its own fault is over."""
     again: ClassVar[tuple[str, ...]] = ()
     """Arguments that choose the motion of another run after the fault."""
+    usual_s: ClassVar[float]
+    """Length of a run whose case has none of its own [s]."""
+    by_program: ClassVar[bool] = False
+    """Whether a policy, or a dry run, is run by a program; see :meth:`deployment`."""
 
     def __init__(
         self,
@@ -249,11 +255,18 @@ class Rig(ABC):
 
     def command(self, out: str, port: str = "") -> list[str]:
         """Return the command line of a run."""
+        if self.by_program and (self.case.policy or self.case.dry):
+            return self.deployment(out, port)
         dry = ["--dry-run"] if self.case.dry else []
         where = ["--port", port or self.port, "--out", str(self.folder / out)]
         return [UNDER_TEST, "-m", "deal_hw", *self.arguments(), *where, *dry]
 
-    def deployment(self, seconds: float, out: str, port: str = "") -> list[str]:
+    @property
+    def seconds(self) -> float:
+        """Length of the run [s]."""
+        return self.case.seconds or self.usual_s
+
+    def deployment(self, out: str, port: str = "") -> list[str]:
         """Return the command line of a run of the case's policy on a robot without legs.
 
         A policy's fault begins at a commanded velocity, so that its trial does not find the fault. `deploy`
@@ -262,7 +275,7 @@ class Rig(ABC):
         _, policy, _, wanted = self.policy_arguments()
         where = [self.wire, port or self.port, str(self.folder / out / "dataset")]
         dry = ["dry"] * self.case.dry
-        return [UNDER_TEST, "-c", DEPLOY, self.robot, policy, wanted, str(seconds), *where, *dry]
+        return [UNDER_TEST, "-c", DEPLOY, self.robot, policy, wanted, str(self.seconds), *where, *dry]
 
     def launch(self, out: str, port: str = "", command: Sequence[str] = ()) -> subprocess.Popen[str]:
         """Start a run, or another command, in a process group of its own, as a shell does."""
@@ -422,6 +435,32 @@ class Rig(ABC):
                         os.kill(pid, signal.SIGKILL)
                 break
             time.sleep(0.01)
+
+
+class FileRig(Rig):
+    """A robot of a robot.yaml, which is known when its files are written, one for each repetition.
+
+    Attributes:
+        file: What robot.yaml holds.
+    """
+
+    def __init__(
+        self,
+        case: Case,
+        wire: str,
+        folder: Path,
+        rng: np.random.Generator,
+        slot: int = 0,
+        typical_s: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(case, wire, folder, rng, slot, typical_s)
+        self.file = self.written()
+        self.robot = str(folder / "robot.yaml")  # type: ignore[misc]
+        self.description = file_description(self.file, folder / "arm.xml")  # type: ignore[misc]
+
+    @abstractmethod
+    def written(self) -> RobotFile:
+        """Write arm.xml and robot.yaml into the folder, and return what the latter holds."""
 
 
 def headline(printed: str) -> str:

@@ -14,10 +14,8 @@ import os
 import signal
 import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from arm_rig import BUSES, arm_file
 from fault_acts import (
     JOINT_FAULTS,
@@ -30,7 +28,7 @@ from fault_acts import (
     process_cases,
     signal_run,
 )
-from fault_rig import ANY, ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
+from fault_rig import ANY, ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, FileRig, Rig
 from fault_table import main
 
 from deal_hw.clock import MonotonicClock
@@ -40,8 +38,7 @@ from deal_hw.drivers.servo_bus.interface import ServoBus
 from deal_hw.drivers.servo_bus.other_master import DOUBLED, FOREIGN
 from deal_hw.drivers.transports.serial_transport import SerialTransport
 from deal_hw.errors import FrameError, TransportError
-from deal_hw.sim.robots.file_description import file_description
-from deal_hw.sim.robots.robot_file import write_robot_file
+from deal_hw.sim.robots.robot_file import RobotFile, write_robot_file
 
 SECONDS = 1.5
 ARMED, IDLE, BRAKING, PARTLY, STOPPED = "armed", "idle", "braking", "partly", "stopped"
@@ -57,7 +54,7 @@ READING_S, READING_RATE_HZ = 3.0, 50.0
 """How long another program reads all servos, and how often."""
 
 
-class ArmRig(Rig):
+class ArmRig(FileRig):
     """An arm of two joints that plays a chirp; a wire is the kind of its servos."""
 
     robot = ARM
@@ -67,21 +64,13 @@ class ArmRig(Rig):
     inactive = frozenset({IDLE, BRAKING, STOPPED})
     phases = (CONNECTING, TAKING_OVER, ARMING, RUNNING, ENDING)
 
-    def __init__(
-        self,
-        case: Case,
-        wire: str,
-        folder: Path,
-        rng: np.random.Generator,
-        slot: int = 0,
-        typical_s: Mapping[str, float] | None = None,
-    ) -> None:
-        super().__init__(case, wire, folder, rng, slot, typical_s)
-        file = dataclasses.replace(arm_file(folder, wire), state_rate_hz=100.0)
-        (folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
-        # The arm is known when its files are written, one for each repetition.
-        self.robot = str(folder / "robot.yaml")  # type: ignore[misc]
-        self.description = file_description(file, folder / "arm.xml")  # type: ignore[misc]
+    usual_s = SECONDS
+
+    def written(self) -> RobotFile:
+        """Two joints whose states come 100 times a second."""
+        file = dataclasses.replace(arm_file(self.folder, self.wire), state_rate_hz=100.0)
+        (self.folder / "robot.yaml").write_text(write_robot_file(file), encoding="utf-8")
+        return file
 
     def emulator_options(self) -> list[str]:
         """A port that keeps its name when the cable is put back."""
@@ -92,11 +81,7 @@ class ArmRig(Rig):
     def arguments(self) -> list[str]:
         """Play the motion."""
         motion = self.case.motion or ("--motion", "chirp")
-        return ["collect", self.robot, *motion, "--seconds", str(self._seconds)]
-
-    @property
-    def _seconds(self) -> float:
-        return self.case.seconds or SECONDS
+        return ["collect", self.robot, *motion, "--seconds", str(self.seconds)]
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
         """Phases by the time after the first torque; the emulated arm begins near its start pose."""
@@ -104,8 +89,8 @@ class ArmRig(Rig):
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (ARMED, 0.0, 0.1),
             ARMING: (ARMED, 0.1, 0.2),
-            RUNNING: (ARMED, 0.4, min(self._seconds, SECONDS) - 0.8),
-            ENDING: (ARMED, self._seconds - 0.1, 0.15),
+            RUNNING: (ARMED, 0.4, min(self.seconds, SECONDS) - 0.8),
+            ENDING: (ARMED, self.seconds - 0.1, 0.15),
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:

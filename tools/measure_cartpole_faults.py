@@ -43,6 +43,8 @@ class CartpoleRig(Rig):
     robot = "cartpole"
     wires = ("serial", "can", "odrive", "dynamixel")
     longest_s = 1.0
+    usual_s = SECONDS
+    by_program = True
     active = frozenset({ARMED})
     inactive = frozenset({IDLE, HELD, STOPPED})
     description = DESCRIPTION
@@ -55,18 +57,8 @@ class CartpoleRig(Rig):
 
     def arguments(self) -> list[str]:
         """Play a chirp."""
-        motion = ["--motion", "chirp", "--seconds", str(self._seconds)]
+        motion = ["--motion", "chirp", "--seconds", str(self.seconds)]
         return ["collect", "cartpole", "--transport", self.wire, *motion]
-
-    def command(self, out: str, port: str = "") -> list[str]:
-        """Return the command line of a run; a policy runs by a program of its own."""
-        if self.case.policy or self.case.dry:
-            return self.deployment(self._seconds, out, port)
-        return super().command(out, port)
-
-    @property
-    def _seconds(self) -> float:
-        return self.case.seconds or SECONDS
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
         """Phases by the device's modes; the later ones by their time after arming."""
@@ -74,8 +66,8 @@ class CartpoleRig(Rig):
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (HOMING, 0.0, self.typical_s[TAKING_OVER]),
             ARMING: (ARMED, 0.0, 0.02),
-            RUNNING: (ARMED, 0.05, min(self._seconds, SECONDS) - 0.2),
-            ENDING: (ARMED, self._seconds - 0.1, 0.15),
+            RUNNING: (ARMED, 0.05, min(self.seconds, SECONDS) - 0.2),
+            ENDING: (ARMED, self.seconds - 0.1, 0.15),
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:

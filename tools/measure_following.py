@@ -150,7 +150,7 @@ def main() -> int:
     robots = fleet()
     names = tuple(args.robots.split(",")) if args.robots else tuple(robots)
     key = ("robot", "profile", "fault" if args.faults else "motion", "seed")
-    made_rows = Rows(__file__, args.out, key)
+    kept = Rows(__file__, args.out, key)
     for name in names:
         one = robots[name]
         profiles = args.profiles.split(",") if args.profiles else one.profiles
@@ -162,12 +162,12 @@ def main() -> int:
             todo = [(profile, motion) for profile in profiles for motion in one.motions]
         for profile, what in todo:
             for seed in args.seeds:
-                if made_rows.done(name, profile, what, seed):
+                if kept.done(name, profile, what, seed):
                     continue
                 measure = faulty if args.faults else sound
                 row = dict(zip(key, (name, profile, what, seed), strict=True))
-                made_rows.add(row | measure(one, profile, what, seed), "")
-    print(fault_table(made_rows.rows) if args.faults else sound_table(made_rows.rows))
+                kept.add(row | measure(one, profile, what, seed), "")
+    print(fault_table(kept.rows) if args.faults else sound_table(kept.rows))
     return 0
 
 

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,7 @@ from fault_acts import (
     process_cases,
     signal_run,
 )
-from fault_rig import ANY, ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, Rig
+from fault_rig import ANY, ARMING, CONNECTING, ENDING, RUNNING, TAKING_OVER, Case, FileRig, Rig
 from fault_table import main
 from ros2_rig import ros2_file
 
@@ -36,7 +35,7 @@ from deal_hw.drivers.ros2.command_log import AGAIN, FIRST, HOLDS, MOVES
 from deal_hw.drivers.ros2.connect import make_link
 from deal_hw.drivers.ros2.messages import encode_positions
 from deal_hw.drivers.ros2.topics import topics_of
-from deal_hw.sim.robots.file_description import file_description
+from deal_hw.sim.robots.robot_file import RobotFile
 from deal_hw.transport import Message
 from deal_hw.workflows.emulation.topics import free_port
 
@@ -61,7 +60,7 @@ BACK = ("sound", "controller active")
 BY_ITSELF = (*JOINT_FAULTS, "controller off", "frozen")
 
 
-class Ros2Rig(Rig):
+class Ros2Rig(FileRig):
     """A robot of two joints behind a forward position controller, which plays a chirp or a multisine."""
 
     robot = ROBOT
@@ -73,20 +72,12 @@ class Ros2Rig(Rig):
     over = frozenset(BACK)
     again = ("--motion", "hold", "--seconds", "0.5")
 
-    def __init__(
-        self,
-        case: Case,
-        wire: str,
-        folder: Path,
-        rng: np.random.Generator,
-        slot: int = 0,
-        typical_s: Mapping[str, float] | None = None,
-    ) -> None:
-        super().__init__(case, wire, folder, rng, slot, typical_s)
-        self.file = ros2_file(folder, domain=_DOMAIN + slot)
-        # The robot is known when its files are written, one for each repetition.
-        self.robot = str(folder / "robot.yaml")  # type: ignore[misc]
-        self.description = file_description(self.file, folder / "arm.xml")  # type: ignore[misc]
+    usual_s = SECONDS
+    by_program = True
+
+    def written(self) -> RobotFile:
+        """Two joints in a domain that no real robot uses."""
+        return ros2_file(self.folder, domain=_DOMAIN + self.slot)
 
     def emulator_options(self) -> list[str]:
         """Listen at a free port, or in a domain that no real robot uses."""
@@ -96,17 +87,7 @@ class Ros2Rig(Rig):
     def arguments(self) -> list[str]:
         """Play the motion."""
         motion = self.case.motion or ("--motion", "chirp")
-        return ["collect", self.robot, "--transport", self.wire, *motion, "--seconds", str(self._seconds)]
-
-    def command(self, out: str, port: str = "") -> list[str]:
-        """Return the command line of a run; a policy runs by a program of its own."""
-        if self.case.policy or self.case.dry:
-            return self.deployment(self._seconds, out, port)
-        return super().command(out, port)
-
-    @property
-    def _seconds(self) -> float:
-        return self.case.seconds or SECONDS
+        return ["collect", self.robot, "--transport", self.wire, *motion, "--seconds", str(self.seconds)]
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
         """Phases by the time after the first command."""
@@ -114,8 +95,8 @@ class Ros2Rig(Rig):
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (FIRST, 0.0, 0.7),
             ARMING: (FIRST, 0.7, _START_S - 0.7),
-            RUNNING: (FIRST, _START_S + 0.05, min(self._seconds, SECONDS) - 0.3),
-            ENDING: (FIRST, _START_S + self._seconds - 0.1, 0.2),
+            RUNNING: (FIRST, _START_S + 0.05, min(self.seconds, SECONDS) - 0.3),
+            ENDING: (FIRST, _START_S + self.seconds - 0.1, 0.2),
         }[phase]
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:

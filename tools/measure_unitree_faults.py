@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import argparse
+import signal
 import sys
 from collections.abc import Mapping
 from typing import ClassVar
@@ -65,11 +66,6 @@ class CraneRig(UnitreeRig, abc.ABC):
     phases = (CONNECTING, TAKING_OVER, ARMING, RUNNING, ENDING)
     longest_s = 3.5
 
-    @property
-    def seconds(self) -> float:
-        """The way to the default pose comes first."""
-        return self.case.seconds or self.description.limits.ease_in_s + HOLD_S
-
     def emulator_options(self) -> list[str]:
         """Its own controller is off, so that a run need not wait for it; in a dry run it must stay on."""
         return [*super().emulator_options(), *([] if self.case.dry else ["--controller", "off"])]
@@ -83,12 +79,11 @@ class CraneRig(UnitreeRig, abc.ABC):
 
     def phase_at(self, phase: str) -> tuple[str, float, float]:
         """Phases by the robot's commands; the later ones by their time after the first stiff command."""
-        usual_s = self.description.limits.ease_in_s + HOLD_S
         return {
             CONNECTING: ("start", 0.0, self.typical_s[CONNECTING]),
             TAKING_OVER: (REQUEST, 0.0, self.typical_s[TAKING_OVER]),
             ARMING: (DAMPING, 0.0, 0.02),
-            RUNNING: (STIFF, 0.0, min(self.seconds, usual_s) - 0.1),
+            RUNNING: (STIFF, 0.0, min(self.seconds, self.usual_s) - 0.1),
             ENDING: (STIFF, self.seconds - 0.12, 0.12),
         }[phase]
 
@@ -98,6 +93,10 @@ class G1Rig(CraneRig):
 
     robot = "g1"
     description = g1.DESCRIPTION
+    # The way to the default pose comes first.
+    usual_s = g1.DESCRIPTION.limits.ease_in_s + HOLD_S
+    mode_machine: ClassVar[int] = 5
+    """The emulated version of 29 joints."""
     types: ClassVar[Mapping[str, str]] = G1Robot.types
 
     def stiff_command(self) -> bytes:
@@ -111,15 +110,13 @@ class G1Rig(CraneRig):
         )
         return G1CommandEncoder(d.joint_names).encode(command)
 
-    mode_machine: ClassVar[int] = 5
-    """The emulated version of 29 joints."""
-
 
 class H1Rig(CraneRig):
     """An H1."""
 
     robot = "h1"
     description = h1.DESCRIPTION
+    usual_s = h1.DESCRIPTION.limits.ease_in_s + HOLD_S
 
     def stiff_command(self) -> bytes:
         """The default pose, with little stiffness."""
@@ -137,7 +134,12 @@ def crane_cases(*own: Case) -> tuple[Case, ...]:
         *joint_cases(JOINT_S, IN_MOTION_S, exchanged=False),
         # A policy gets no wanted velocity in the air, so none can be made to hang there.
         *(case for case in process_cases() if case.policy != "hang"),
-        Case(name="the terminal is closed (SIGHUP)", act=signal_run(1), phases=ANY[1:], codes=(130,)),  # type: ignore[arg-type]
+        Case(
+            name="the terminal is closed (SIGHUP)",
+            act=signal_run(signal.SIGHUP),
+            phases=ANY[1:],
+            codes=(130,),
+        ),
         Case(
             name="both processes are killed (SIGKILL)",
             act=kill_both,

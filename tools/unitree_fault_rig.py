@@ -27,8 +27,6 @@ class UnitreeRig(Rig, abc.ABC):
     wires = ("zenoh", "dds")
     active = frozenset({STIFF})
     inactive = frozenset({DAMPING, OFF})
-    usual_s: ClassVar[float]
-    """Length of a run [s]."""
     types: ClassVar[Mapping[str, str]] = {}
     """Types of topics that have another type than the Go2's."""
 
@@ -51,11 +49,6 @@ class UnitreeRig(Rig, abc.ABC):
     def wire_arguments(self) -> list[str]:
         """Return the arguments of a run for its wire."""
         return ["--transport", self.wire, *(["--domain", self.domain] if self.wire == "dds" else [])]
-
-    @property
-    def seconds(self) -> float:
-        """Length of this run [s]."""
-        return self.case.seconds or self.usual_s
 
     def changes(self, report: Mapping[str, Any]) -> list[tuple[int, str]]:
         """Kinds of commands that the robot received."""
