@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -96,9 +97,14 @@ def _shipped(path: Path) -> bool:
     """
     own = __name__.partition(".")[0]
     parts = [module for name, module in list(sys.modules.items()) if name.partition(".")[0] == own]
-    folders = {os.path.realpath(root) for part in parts for root in getattr(part, "__path__", ())}
-    real = path.resolve()
-    return any(real.is_relative_to(folder) for folder in folders)
+    folders = {_real(root) for part in parts for root in getattr(part, "__path__", ())}
+    return not folders.isdisjoint(map(str, path.resolve().parents))
+
+
+@functools.cache
+def _real(folder: str) -> str:
+    """Return the path of a package's folder without links; it costs as much as compiling a small model."""
+    return os.path.realpath(folder)
 
 
 def _compiled(path: Path) -> mujoco.MjModel:
