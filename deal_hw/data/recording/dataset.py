@@ -76,12 +76,7 @@ class Dataset:
         """
         folder = Path(folder)
         facts = description.to_json() if isinstance(description, RobotDescription) else dict(description)
-        try:
-            (folder / "episodes").mkdir(parents=True, exist_ok=True)
-            lock = _lock(folder)
-        except OSError as error:
-            raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
-        with _released_on_error(folder, lock):
+        with _locked(folder, make=True) as lock:
             if (folder / INDEX_NAME).exists():
                 dataset = cls._load(folder, lock, notify)
                 _refuse_other(folder, dataset.description, facts)
@@ -129,11 +124,7 @@ class Dataset:
             DatasetError: It is not a dataset, a collector has it open, or it cannot be read or written.
         """
         folder = _existing(folder)
-        try:
-            lock = _lock(folder)
-        except OSError as error:
-            raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
-        with _released_on_error(folder, lock):
+        with _locked(folder) as lock:
             dataset = cls._load(folder, lock, notify)
             dataset._adopt()
         return dataset
@@ -292,8 +283,10 @@ class Dataset:
         """Add recordings that the index does not name, because their collector was killed."""
         known = {episode.file for episode in self.episodes}
         found = [f"episodes/{path.name}" for path in sorted((self.folder / "episodes").glob("[0-9]*.mcap"))]
-        strays = [file for file in found if file not in known]
-        for file in strays:
+        added = []
+        for file in found:
+            if file in known:
+                continue
             try:
                 if number_in(file) < 0:
                     raise DatasetError(f"it has no name such as {EXAMPLE}; rename it")
@@ -304,7 +297,9 @@ class Dataset:
             self._notify(
                 f"{self.folder / file} was not in the index; it was added, with {info.states} state samples"
             )
-            self.change((*self.episodes, info))
+            added.append(info)
+        if added:
+            self.change((*self.episodes, *added))
         removed = [f"episodes/{path.name}" for path in (self.folder / REMOVED_FOLDER).glob("*.mcap")]
         # A number is never used twice, or results would name another episode than the one they are from.
         self._next = max([-1, *map(number_in, (*found, *removed)), *self.numbers]) + 1
@@ -341,18 +336,31 @@ def _existing(folder: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _released_on_error(folder: Path, lock: int) -> Iterator[None]:
-    """Release the lock of a dataset if the block raises.
+def _locked(folder: Path, *, make: bool = False) -> Iterator[int]:
+    """Lock a dataset, and keep the lock unless the block raises.
+
+    Args:
+        folder: The dataset.
+        make: Make its folders first.
+
+    Yields:
+        The descriptor of the lock.
 
     Raises:
-        DatasetError: Another process holds the lock.
+        DatasetError: It cannot be written, or another process holds the lock.
     """
+    try:
+        if make:
+            (folder / "episodes").mkdir(parents=True, exist_ok=True)
+        lock = _lock(folder)
+    except OSError as error:
+        raise DatasetError(f"dataset {folder} cannot be written: {error.strerror}") from error
     if lock < 0:
         raise DatasetError(
             f"dataset {folder} is in use by another collector; wait for it or name another folder"
         )
     try:
-        yield
+        yield lock
     except BaseException:
         os.close(lock)
         raise
