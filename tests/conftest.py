@@ -185,3 +185,16 @@ def no_check_fails(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
     yield
     if failed and "checks_may_fail" not in request.fixturenames:
         raise failed[0]
+
+
+@pytest.fixture(autouse=True)
+def signals_are_left_as_they_were() -> Iterator[None]:
+    """Fail a test that leaves a handler of Ctrl-C or SIGTERM behind: a later one would fail for it."""
+    # The functions themselves: a test may have replaced those of the module until after this.
+    handler_of, set_handler = signal.getsignal, signal.signal
+    before = {number: handler_of(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    left = {number: handler_of(number) for number in before}
+    for number, handler in before.items():
+        set_handler(number, handler)
+    assert left == before

@@ -33,7 +33,7 @@ from deal_hw.calib.fit.refinement import Refined, local_fit, refine
 from deal_hw.calib.fit.residual import Normal, Shooting
 from deal_hw.calib.fit.solver import correlated_samples
 from deal_hw.calib.pipeline import minima, stages
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.methods import make_method, usual_budget
 from deal_hw.calib.pipeline.minima import RestartSettings, conclusive, lower_minimum
@@ -223,7 +223,7 @@ def test_refinement_with_noise_finds_the_latency_and_covers(noisy: Case) -> None
     inside = (result.interval[:, 0] <= noisy.theta) & (noisy.theta <= result.interval[:, 1])
     assert inside.sum() >= 7
     assert result.alarms == ()
-    assert set(stages) == {BEFORE_SEARCH, "search", "refinement", "latency"}
+    assert set(stages) == {BEFORE_SEARCH, "search", "refinement", AFTER_FIT, "latency"}
     assert result.provenance["latency_scan"]["ticks"]
 
 
