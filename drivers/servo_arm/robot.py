@@ -190,11 +190,13 @@ class ServoArm(PolledRobot[ServoBus]):
         end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         rest = self._found_limp if None in self._rest else np.array(self._rest, dtype=float)
         self._asked = ()
-        at = self._codec.positions(self._samples(end_ns))
+        samples = self._samples(end_ns)
+        # With the nominal gains and limits: those of the last command may be too weak to carry the arm.
+        self._written = None
+        self._bus.post(self._writes(self._codec.at({i: clipped(one.ticks) for i, one in samples.items()})))
         if rest is not None:
-            self._move(at, rest, end_ns)
+            self._move(self._codec.positions(samples), rest, end_ns)
             return ""
-        self._bus.post(self._family.goals(self._codec.goals(at)))
         self._holds = True
         return (
             f"{self.description.name} holds its pose with stiff motors, since no pose is known in which it "

@@ -74,6 +74,23 @@ def test_a_planned_end_lowers_the_arm_first(tmp_path: Path, bus: str) -> None:
     assert rig.device.mode == ("idle" if bus == "dynamixel" else "braking")
 
 
+class Weak(HoldBehaviour):
+    """Holds the start pose with a part of each drive's stiffness and limit, as an excitation may end."""
+
+    def command(self, state: RobotState, time_s: float) -> JointCommand:
+        held = super().command(state, time_s)
+        return dataclasses.replace(
+            held, stiffness=0.15 * held.stiffness, effort_limit=0.02 * held.effort_limit
+        )
+
+
+def test_an_arm_that_is_weak_at_the_end_is_lowered_with_its_nominal_gains(tmp_path: Path, bus: str) -> None:
+    """The last command's gains and limits could not move it: it would be "not following", and drop."""
+    rig = lowered(tmp_path, bus)
+    assert played(rig, Weak(rig.description)).outcome is Outcome.FINISHED
+    np.testing.assert_allclose(rig.true_position(), [1.0, -0.5], atol=0.15)
+
+
 def test_a_stop_on_the_way_down_makes_it_passive_at_once(tmp_path: Path, bus: str) -> None:
     """Ctrl-C does not wait for the rest pose."""
     rig = lowered(tmp_path, bus)
