@@ -300,7 +300,7 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         """Let commands through; the robot holds its start pose until the first.
 
         Raises:
-            SafetyError: It was not homed, or another program publishes commands.
+            SafetyError: It was not homed, another program publishes commands, or the controller is off.
             TransportTimeoutError: No new states arrive.
         """
         self._check_connected()
@@ -311,9 +311,16 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
             raise SafetyError(self._fault)
         self._hold = self._passive_ns = None
         self._stream.trouble = ""
-        self._publish(self._target)
-        self._await_new_states(timeout_s)
+        # From here on a word of the controller_manager or a command of another program is a fault.
         self._armed = True
+        try:
+            self._publish(self._target)
+            self._await_new_states(timeout_s)
+            if self._fault:
+                raise SafetyError(self._fault)
+        except BaseException:
+            self._armed = False
+            raise
         self._states.clear()
 
     def send_command(self, command: JointCommand) -> JointCommand:
