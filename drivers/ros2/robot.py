@@ -361,8 +361,8 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
     def passive(self) -> None:
         """Hold the joints where they were measured; the pose stays until the robot is homed or armed again.
 
-        So an arm does not sag step by step. A joint that was moved away, while its drive was off, is not
-        brought back: there the pose is measured anew.
+        So an arm does not sag step by step. A joint that was moved away, while its drive was off or by
+        another program, is not brought back: there the pose is measured anew.
 
         States received before are dropped. Nothing is sent by a run that never commanded the robot, nor while
         another program commands it: two would fight.
@@ -378,9 +378,10 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         if self._in_charge and not self._in_force:
             return
         now_ns = self._clock.now_ns()
-        if self._hold is None or self._is_astray(now_ns):
+        contested = self._is_contested(now_ns)
+        if self._hold is None or contested or self._is_astray(now_ns):
             self._hold = self._pose_to_hold(now_ns)
-        if self._passive_ns is None or not self._is_contested(now_ns):
+        if self._passive_ns is None or not contested:
             self._publish(self._hold)
         self._passive_ns = now_ns
 
@@ -388,12 +389,19 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         state = self._newest
         if state is None or self._hold is None or now_ns - state.receive_ns > _FRESH_NS:
             return False
-        return bool((np.abs(state.position[self._actuated] - self._hold) > self._astray).any())
+        at = self._credible(state.position[self._actuated], self._hold)
+        return bool((np.abs(at - self._hold) > self._astray).any())
+
+    def _credible(self, position: FloatArray, otherwise: FloatArray) -> FloatArray:
+        """Return readings, and another pose where no joint can be: its drive would go there, (A,)."""
+        low, high = np.array(self.description.limits.trip_position)[self._actuated].T
+        return np.where((low <= position) & (position <= high), position, otherwise)
 
     def _pose_to_hold(self, now_ns: int) -> FloatArray:
         state = self._newest
         if state is not None and now_ns - state.receive_ns <= _FRESH_NS:
-            return np.asarray(state.position[self._actuated])
+            at: FloatArray = state.position[self._actuated]
+            return at if self._target is None else self._credible(at, self._target)
         if self._target is not None:
             # The robot goes there or is there: an older measurement would make it jump back.
             return self._target
