@@ -155,7 +155,7 @@ class ServoArm(PolledRobot[ServoBus]):
             self._homing = False
 
     def arm(self, timeout_s: float) -> None:
-        """Give torque where the arm is, if it has none; the watchdogs start.
+        """Give torque where the arm is, if it has none.
 
         Raises:
             SafetyError: It was never homed, or a servo reports an error.
@@ -167,11 +167,14 @@ class ServoArm(PolledRobot[ServoBus]):
         end_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         if any(sample.torque != ON for sample in self._samples(end_ns).values()):
             self._torque_on(end_ns)
+        # A watchdog that tripped since homing is cleared.
+        self._bus.post(self._family.alive(self._ids, True))
         self._states.clear()
         self._asked = ()
-        while Status.ARMED not in (state := self.read_state(self._left_s(end_ns))).status:
-            continue
-        self._bus.post(self._family.alive(self._ids, True))
+        while True:
+            state = self.read_state(self._left_s(end_ns))
+            if Status.ARMED in state.status and Status.WATCHDOG not in state.status:
+                break
         self._states.append(state)
         self._armed, self._anchored, self._alive_ns = True, False, self._clock.now_ns()
         self._sent.clear()
@@ -231,6 +234,8 @@ class ServoArm(PolledRobot[ServoBus]):
             if all(sample.torque == ON for sample in self._samples(end_ns).values()):
                 break
             self._require_time(end_ns, "the servos give no torque")
+        # From here on they notice when this host dies.
+        self._bus.post(self._family.alive(self._ids, True))
         self._written = registers
         return start
 

@@ -371,6 +371,20 @@ def test_a_silent_host_is_stopped_by_servos_that_can(rig: Rig, bus: str) -> None
     assert np.abs(rig.run(20, target=0.2)[-1].position - 0.2).max() < 0.05
 
 
+def test_a_host_that_dies_before_the_first_command_is_noticed_by_servos_that_can(tmp_path: Path) -> None:
+    """From the begin of homing on; who is only slow arms all the same."""
+    rig = Rig(tmp_path, "dynamixel")
+    robot = rig.robot
+    robot.connect()
+    robot.home(10.0)
+    rig.advance(0.3)
+    assert rig.device.mode == "stopped"
+    robot.arm(1.0)
+    states = rig.run(20, target=0.2)
+    assert rig.device.mode == "armed" and not any(Status.WATCHDOG in state.status for state in states)
+    assert np.abs(states[-1].position - 0.2).max() < 0.05
+
+
 def test_who_only_reads_states_does_not_keep_the_motors_going(tmp_path: Path) -> None:
     """Our questions keep the servos' watchdogs quiet, so the driver itself ends a motion without commands."""
     rig = Rig(tmp_path, "dynamixel")
