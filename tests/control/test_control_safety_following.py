@@ -40,7 +40,7 @@ def robot(
         target_step=free,
         target_distance=free,
         trip_position=((-math.inf, math.inf),) * n,
-        trip_velocity=(5.0,) * n,
+        trip_velocity=changes.pop("trip_velocity", (5.0,) * n),
         stiffness=free,
         damping=free,
         effort=free,
@@ -135,6 +135,28 @@ def test_half_a_push_takes_longer_since_it_becomes_the_usual_load() -> None:
     From the state n = 3 on, 0.02 s * 0.5 * (0.98^3 + ... + 0.98^n) is 0.3 s at n = 53: at the 54th state.
     """
     found = play(FollowingWatch(robot()), after_start(0.1, 0.0), still(0.0, 0.0))
+    assert found is not None and found[0] == pytest.approx(54 * PERIOD_S)
+
+
+def test_joints_that_stand_together_are_found_sooner() -> None:
+    """As above with two joints: from n = 3 on, 2 * 0.02 s * 0.5 * 0.98^n add up to 0.45 s at n = 35."""
+    found = play(FollowingWatch(robot()), after_start(0.1, -0.1), still(0.0, 0.0))
+    assert found is not None and found[0] == pytest.approx(36 * PERIOD_S)
+    assert found[1].joints == ("a", "b")
+
+
+def test_a_joint_that_follows_clears_what_the_others_have_together() -> None:
+    """The drives are on, so each joint is judged alone: as above, 54 states."""
+
+    def stepped(time_s: float) -> tuple[float, ...]:
+        return (*after_start(0.1, -0.1)(time_s), 0.3 * int(2 * time_s))
+
+    def followed(time_s: float) -> tuple[float, ...]:
+        step = int(2 * time_s)
+        return 0.0, 0.0, max(0.3 * (step - 1) + min(1.5 * (time_s - step / 2), 0.3), 0.0)
+
+    three = robot(units=("rad",) * 3, trip_velocity=(100.0,) * 3)
+    found = play(FollowingWatch(three), stepped, followed)
     assert found is not None and found[0] == pytest.approx(54 * PERIOD_S)
 
 

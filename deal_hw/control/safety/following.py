@@ -7,10 +7,10 @@ or its drive is off, or the reading is not that of this joint.
 
 A joint that stands while it is pushed to one side and then to the other is found at once. Else what counts is
 the push over time. At the drive's limit it is noticed after 0.36 s, at a third of the limit after 1 s, at the
-least push after 2 s. A leg that never reaches its set-point under load follows: its load is usual. A joint
-that moves at its limit follows, too. Two kinds of wrong readings are found in another way: a reading that
-jumps faster than the joint can move, and readings that fit the set-point of another joint, or the own one
-with the other sign.
+least push after 2 s, and sooner where several joints stand and none follows. A leg that never reaches its
+set-point under load follows: its load is usual. A joint that moves at its limit follows, too. Two kinds of
+wrong readings are found in another way: a reading that jumps faster than the joint can move, and readings
+that fit the set-point of another joint, or the own one with the other sign.
 
 Pure: no I/O, and time is an argument.
 """
@@ -35,6 +35,9 @@ PUSH_S: Final = 0.3
 tools/measure_following.py has what shipped motions reach. On eight recordings of a real SO-101 (from
 isaac-sim2real/sage) it is at most 0.12, and 0.29 where its fingertip presses on a table. With a stiffness
 that is 1.6 times too high it is above 0.3 there, and at most 0.22 elsewhere."""
+TOGETHER_S: Final = 0.45
+"""The same of all joints together, while none of them follows [s]: with limp drives all stand. On those
+recordings it is at most 0.12, and 0.39 at the table."""
 LEAST_PUSH: Final = 0.15
 """A smaller share of the drive's limit beyond the usual load does not count: friction, or a new load."""
 LOAD_S: Final = 1.0
@@ -180,7 +183,7 @@ class FollowingWatch:
         self._smooth, self._rest = self._load.copy(), self._load.copy()
         self._least, self._greatest = self._load.copy(), self._load.copy()
         self._way = np.zeros(count)
-        self._way_s, self._counted = np.zeros(count), np.zeros(count)
+        self._way_s, self._counted, self._together = np.zeros(count), np.zeros(count), 0.0
         self._from, self._from_velocity = position.copy(), velocity.copy()
         self._followed_ns, self._near_ns = np.full(count, now_ns), np.full(count, now_ns)
         self._before, self._odd = position.copy(), np.zeros(count, dtype=bool)
@@ -219,15 +222,17 @@ class FollowingWatch:
         anew = turned | follows
         self._from = np.where(anew, position, self._from)
         self._from_velocity = np.where(anew, velocity, self._from_velocity)
-        idle = np.maximum(self._counted - FORGET * passed_s, 0.0)
         counts = pushes & (self._way_s >= DEAD_S) & ~self._may_be_blocked
-        self._counted = np.where(counts, self._counted + beyond * passed_s, idle)
-        self._counted[follows] = 0.0
+        more = np.where(counts, beyond * passed_s, -FORGET * passed_s)
+        self._counted = np.where(follows, 0.0, np.maximum(self._counted + more, 0.0))
+        together = self._together + (more[counts].sum() if counts.any() else more.max())
+        self._together = 0.0 if follows.any() else max(together, 0.0)
         doubtful = self._odd | (self._counted > 0.0) | (pushes & ~follows)
         self._followed_ns = np.where(doubtful, self._followed_ns, now_ns)
         self._load = self._load + (share - self._load) * min(passed_s / LOAD_S, 1.0)
         self.worst = max(self.worst, float(self._counted.max()))
         late = (self._counted >= PUSH_S) | (self._swung(position, share, passed_s) & ~self._may_be_blocked)
+        late |= (self._together >= TOGETHER_S) & (self._counted > 0.0)
         if not late.any():
             return None
         worst = int(np.argmax(np.where(late, np.abs(share), -1.0)))
