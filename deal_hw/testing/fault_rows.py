@@ -54,6 +54,8 @@ RETURN_S: Final = 1.0
 """Time from a cable's return to the passive robot [s]: the port is opened every 0.5 s."""
 SHOWS_S: Final = 3.0
 """Time in which a joint that does not follow is noticed in a motion of all joints [s]."""
+EARLY_S: Final = 4.0
+"""The same from the first command on, where it failed before: a motion begins with little [s]."""
 WHOLE_S: Final = 12.0
 """Longer than a run of a table [s]."""
 CUT_S: Final = 1.5
@@ -89,6 +91,9 @@ class Lacks:
     why: str
 
 
+WAITS: Final = Expected(end="goes on", why="who connects waits for states, longer than the fault lasts")
+NO_TIME_YET: Final = Expected(end="goes on", why="no time is known before the first state")
+NOT_ARMED: Final = Expected(end="goes on", why="times count from the arming on")
 Act = Callable[["FaultRig"], None]
 Cell = Expected | Lacks
 
@@ -131,6 +136,7 @@ class FaultTable:
         joint: The joint whose reading is wrong; "": the first one with a drive.
         may_not_show: Faults that its motion may be too small to show, and why; the run may then finish.
         rows: What differs from the usual rows, by fault.
+        cells: Single cells that differ from their rows, by fault and phase.
     """
 
     name: str
@@ -143,10 +149,16 @@ class FaultTable:
     joint: str = ""
     may_not_show: Mapping[str, str] = field(default_factory=dict)
     rows: Mapping[str, FaultRow | Lacks]
+    cells: Mapping[tuple[str, str], Expected] = field(default_factory=dict)
 
     def all_rows(self) -> dict[str, FaultRow | Lacks]:
         """Return the rows of every fault, the usual ones first."""
-        return {**usual_rows(self), **self.rows}
+        rows = {**usual_rows(self), **self.rows}
+        for (fault, phase), cell in self.cells.items():
+            row = rows[fault]
+            assert isinstance(row, FaultRow)
+            rows[fault] = replace(row, cells={**row.cells, phase: cell})
+        return rows
 
     def combinations(self) -> dict[tuple[str, str], Cell]:
         """Return what each fault in each phase must end in, or why the robot lacks it."""
@@ -275,8 +287,8 @@ def usual_rows(table: FaultTable) -> dict[str, FaultRow | Lacks]:
         LAST: replace(back, end="passive or over"),
     }
     shows = Expected(end="passive", within_s=SHOWS_S)
-    later = Expected(end="passive", within_s=SHOWS_S, since="first command")
-    too_late = Expected(end="passive or over", within_s=4.0)
+    later = Expected(end="passive", within_s=EARLY_S, since="first command")
+    too_late = Expected(end="passive or over", within_s=EARLY_S)
     reading: dict[str, Cell] = {
         CONNECTING: later,
         HOMING: shows if by_motor else later,

@@ -10,10 +10,18 @@ from typing import Final
 from deal_hw.testing.fault_rows import (
     CLOCK_AHEAD,
     CLOCK_BACK,
+    CONNECTING,
     CONTROLLER_OFF,
+    CUT,
     DUPLICATE,
     FOREIGN,
+    HOMING,
+    NO_TIME_YET,
+    NOT_ARMED,
     PLANNED_END,
+    RETURN_S,
+    WAITS,
+    Expected,
     FaultRig,
     FaultRow,
     FaultTable,
@@ -24,8 +32,8 @@ from deal_hw.testing.fault_rows import (
 
 _FOREIGN_HZ: Final = 47.0
 """No multiple of the control rate: in virtual time its commands would always come just before ours."""
-_START_RAD_S: Final = 0.7
-"""Homing goes at 0.5 rad/s, and the emulated drives, lightly damped, swing about it."""
+_START_RAD_S: Final = 0.77
+"""Homing goes at 0.5 rad/s, and the emulated drives, lightly damped, reach nearly twice that."""
 _ASIDE: Final = 0.2
 """How far aside another program wants the joints [rad]."""
 
@@ -76,6 +84,18 @@ def _table(command: str) -> FaultTable:
             DUPLICATE: Lacks("its joints have names"),
             CLOCK_AHEAD: FaultRow(begin=_ahead, cells=killed_cells(homes_by_motor=True)),
             CLOCK_BACK: FaultRow(begin=_back, cells=killed_cells(homes_by_motor=True)),
+        },
+        cells={
+            (CUT, CONNECTING): WAITS,
+            (FOREIGN, CONNECTING): Expected(
+                end="passive",
+                within_s=RETURN_S,
+                since="return",
+                why="the run is refused; the other program moves the joints as long as it likes",
+            ),
+            (CLOCK_AHEAD, CONNECTING): NO_TIME_YET,
+            (CLOCK_AHEAD, HOMING): NOT_ARMED,
+            (CLOCK_BACK, CONNECTING): NO_TIME_YET,
         },
     )
 

@@ -12,12 +12,16 @@ from deal_hw.testing.fault_rows import (
     CLOCK_BACK,
     CONNECTING,
     CONTROLLER_OFF,
+    CUT,
     DUPLICATE,
     FOREIGN,
     FROZEN,
     HOMING,
+    NO_TIME_YET,
+    NOT_ARMED,
     PHASES,
     PLANNED_END,
+    WAITS,
     Expected,
     FaultRig,
     FaultRow,
@@ -35,6 +39,8 @@ ON_CRANE: Final = "it hangs on a crane: its limbs are damped when the run is ove
 """The same of a humanoid."""
 _HANGING: Final = {FROZEN: "limbs that hang free stay near the set-points of a small motion"}
 """What may not show on a stand or a crane, and why."""
+_RELEASED: Final = Expected(end="goes on", why="homing releases the robot's own controller")
+_SILENT: Final = Expected(end="goes on", why="homing waits until no other program commands for half a second")
 _FOREIGN_HZ: Final = 47.0
 """No multiple of the control rate: in virtual time its commands would always come just before ours."""
 
@@ -100,6 +106,16 @@ def unitree_table(name: str, joint: str, hangs: str = "") -> FaultTable:
         phases={PLANNED_END: Lacks(hangs)} if hangs else {},
         may_not_show=_HANGING if hangs else {},
         rows=unitree_rows(),
+        cells={
+            (CUT, CONNECTING): WAITS,
+            (CONTROLLER_OFF, CONNECTING): _RELEASED,
+            (CONTROLLER_OFF, HOMING): _RELEASED,
+            (FOREIGN, CONNECTING): _SILENT,
+            (FOREIGN, HOMING): _SILENT,
+            (CLOCK_AHEAD, CONNECTING): NO_TIME_YET,
+            (CLOCK_AHEAD, HOMING): NOT_ARMED,
+            (CLOCK_BACK, CONNECTING): NO_TIME_YET,
+        },
     )
 
 
