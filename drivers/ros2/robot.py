@@ -131,7 +131,7 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         self._sequence = -1
         self._newest: RobotState | None = None
         self._armed = self._homed = self._homing = self._in_charge = False
-        self._in_force = b""
+        self._in_force, self._published_ns = b"", -1
         self._target: FloatArray | None = None
         self._hold: FloatArray | None = None
         self._passive_ns: int | None = None
@@ -379,7 +379,8 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
             return
         now_ns = self._clock.now_ns()
         contested = self._is_contested(now_ns)
-        if self._hold is None or contested or self._is_astray(now_ns):
+        overruled = contested and (self._foreign_ns or 0) > self._published_ns
+        if self._hold is None or overruled or self._is_astray(now_ns):
             self._hold = self._pose_to_hold(now_ns)
         if self._passive_ns is None or not contested:
             self._publish(self._hold)
@@ -432,7 +433,7 @@ class Ros2ControlRobot(TopicRobot[JointStateStream]):
         stamp_ns = self._clock.now_ns()
         self._transport.send(Message(self._topics.commands, payload, stamp_ns))
         self._wire.append(Message("tx", payload, stamp_ns))
-        self._in_force, self._target = payload, target.copy()
+        self._in_force, self._target, self._published_ns = payload, target.copy(), stamp_ns
         return stamp_ns
 
     def _wait(self, until_ns: int) -> RobotState:

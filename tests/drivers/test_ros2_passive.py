@@ -60,6 +60,20 @@ def test_after_another_program_the_robot_is_held_where_that_left_it(rig: Ros2Rig
     np.testing.assert_allclose(last_sent(rig)[np.argsort(rig.robot._order)], left, atol=0.05)
 
 
+def test_who_takes_over_holds_one_pose(rig: Ros2Rig) -> None:
+    """The last commands of the process that died came before its own, so they do not overrule it."""
+    rig.armed()
+    rig.run(6, target=1.0)
+    rig.virtual.publish(*rig.device.command_aside(0.2))
+    rig.pass_time(0.01)
+    rig.robot.take_wire()
+    for _ in range(8):
+        rig.robot.passive()
+        rig.pass_time(0.05)
+    sent = {message.payload for message in rig.robot.take_wire() if message.channel == "tx"}
+    assert len(sent) == 1
+
+
 def test_a_controller_that_goes_off_while_the_robot_is_armed_ends_the_arming(rig: Ros2Rig) -> None:
     """The manager says it once, between homing and the first command."""
     rig.robot.connect()
