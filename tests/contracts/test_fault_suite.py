@@ -39,6 +39,14 @@ def judged(cell: Expected = CELL, **changed: Any) -> str:
     return "; ".join(complaints(replace(GOOD, **changed), RUNNING, cell, TABLE))
 
 
+def test_a_single_cell_may_differ_from_its_row() -> None:
+    """The others of the row stay, and a table without the cell too."""
+    differs = replace(TABLE, cells={(FAULTS[0], RUNNING): Expected(end="goes on", why="a toy")})
+    before, after = TABLE.combinations(), differs.combinations()
+    assert {what for what in before if before[what] != after[what]} == {(FAULTS[0], RUNNING)}
+    assert after[FAULTS[0], RUNNING] == Expected(end="goes on", why="a toy")
+
+
 def test_a_robot_that_is_passive_in_time_is_right() -> None:
     """Nothing is complained about."""
     assert judged() == ""
