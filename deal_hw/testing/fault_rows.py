@@ -55,7 +55,7 @@ RETURN_S: Final = 1.0
 SHOWS_S: Final = 3.0
 """Time in which a joint that does not follow is noticed in a motion of all joints [s]."""
 EARLY_S: Final = 4.0
-"""The same from the first command on, where it failed before: a motion begins with little [s]."""
+"""The same where it failed before the motion or as it began: a motion begins with little [s]."""
 WHOLE_S: Final = 12.0
 """Longer than a run of a table [s]."""
 CUT_S: Final = 1.5
@@ -291,7 +291,7 @@ def usual_rows(table: FaultTable) -> dict[str, FaultRow | Lacks]:
     too_late = Expected(end="passive or over", within_s=EARLY_S)
     reading: dict[str, Cell] = {
         CONNECTING: later,
-        HOMING: shows if by_motor else later,
+        HOMING: Expected(end="passive", within_s=EARLY_S) if by_motor else later,
         ARMING: later,
         RUNNING: shows,
         PLANNED_END: too_late,

@@ -5,6 +5,7 @@ In virtual time a wire carries the same messages over DDS and over Zenoh, so the
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 from deal_hw.testing.fault_rows import (
@@ -20,6 +21,7 @@ from deal_hw.testing.fault_rows import (
     NOT_ARMED,
     PLANNED_END,
     RETURN_S,
+    RUNNING,
     WAITS,
     Expected,
     FaultRig,
@@ -64,7 +66,7 @@ def _back(rig: FaultRig) -> None:
     rig.device.jump_clock(-5.0)
 
 
-def _table(command: str) -> FaultTable:
+def _table(command: str, cells: Mapping[tuple[str, str], Expected] | None = None) -> FaultTable:
     return FaultTable(
         name=f"ros2 {command}",
         stiff=lambda device: True,
@@ -96,9 +98,20 @@ def _table(command: str) -> FaultTable:
             (CLOCK_AHEAD, CONNECTING): NO_TIME_YET,
             (CLOCK_AHEAD, HOMING): NOT_ARMED,
             (CLOCK_BACK, CONNECTING): NO_TIME_YET,
+            **(cells or {}),
         },
     )
 
 
 POSITION: Final = _table("position")
-TRAJECTORY: Final = _table("trajectory")
+TRAJECTORY: Final = _table(
+    "trajectory",
+    {
+        (CONTROLLER_OFF, RUNNING): Expected(
+            end="passive",
+            within_s=RETURN_S,
+            since="return",
+            why="an inactive controller takes no command: it gets the pose to hold when it is back",
+        )
+    },
+)
