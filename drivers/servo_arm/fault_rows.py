@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 from deal_hw.drivers.servo_arm.families import ON
@@ -13,11 +14,16 @@ from deal_hw.testing.fault_rows import (
     CLOCK_BACK,
     CONNECTING,
     CONTROLLER_OFF,
+    CUT,
     DUPLICATE,
     EXCHANGED,
     FOREIGN,
+    FROZEN,
     HOMING,
     LIMP,
+    OUT_OF_RANGE,
+    PLANNED_END,
+    RETURN_S,
     SOON_S,
     Expected,
     FaultRig,
@@ -59,7 +65,14 @@ def arm_rows() -> dict[str, FaultRow | Lacks]:
     }
 
 
+_OVER: Final = Expected(
+    end="passive or over",
+    within_s=SOON_S,
+    why="the motion is over and recorded; the arm is not lowered further",
+)
 ARM_CELLS: Final = {
+    **{(fault, PLANNED_END): _OVER for fault in (FOREIGN, DUPLICATE, OUT_OF_RANGE)},
+    (CUT, PLANNED_END): replace(_OVER, within_s=RETURN_S, since="return"),
     (FOREIGN, CONNECTING): Expected(
         end="passive",
         within_s=SOON_S,
@@ -79,8 +92,16 @@ _MAY_NOT_SHOW: Final = {
     EXCHANGED: "two readings of this small motion hardly differ",
     LIMP: "the motion swells: early in it the joints stay near their set-points without torque",
 }
-_PHASES: Final[Mapping[str, float | Lacks]] = {HOMING: 0.01}
-"""It is switched on in its start pose, so homing is short."""
+_CELLS: Final = {
+    **ARM_CELLS,
+    (FROZEN, PLANNED_END): Expected(
+        end="passive or over",
+        within_s=20.0 + SOON_S,
+        why="by its reading it still moves, so it stays stiff in its rest pose for the longest time",
+    ),
+}
+_PHASES: Final[Mapping[str, float | Lacks]] = {HOMING: 0.01, PLANNED_END: 0.01}
+"""It is switched on in its start pose, so homing is short, and so is the way back to it."""
 
 
 FEETECH: Final = FaultTable(
@@ -90,7 +111,7 @@ FEETECH: Final = FaultTable(
     phases=_PHASES,
     may_not_show=_MAY_NOT_SHOW,
     rows=arm_rows(),
-    cells=ARM_CELLS,
+    cells=_CELLS,
 )
 DYNAMIXEL: Final = FaultTable(
     name="arm dynamixel",
@@ -100,5 +121,5 @@ DYNAMIXEL: Final = FaultTable(
     phases=_PHASES,
     may_not_show=_MAY_NOT_SHOW,
     rows=arm_rows(),
-    cells=ARM_CELLS,
+    cells=_CELLS,
 )
