@@ -133,6 +133,8 @@ class FaultTable:
         watchdog_s: The device stops its motors after this time without a command [s]; 0: never.
         start_speed: Fastest joint in the first second of a run, and after a fault [rad/s or m/s].
         phases: When the default fault begins in a phase, or why there is no such phase.
+        may_fall: Whether it may fall when it is damped, and lie so that the next run is refused before any
+            command.
         joint: The joint whose reading is wrong; "": the first one with a drive.
         may_not_show: Faults that its motion may be too small to show, and why; the run may then finish.
         rows: What differs from the usual rows, by fault.
@@ -146,6 +148,7 @@ class FaultTable:
     watchdog_s: float = 0.0
     start_speed: float
     phases: Mapping[str, float | Lacks] = field(default_factory=dict)
+    may_fall: bool = False
     joint: str = ""
     may_not_show: Mapping[str, str] = field(default_factory=dict)
     rows: Mapping[str, FaultRow | Lacks]

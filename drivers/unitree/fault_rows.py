@@ -102,6 +102,7 @@ def unitree_table(name: str, joint: str, hangs: str = "") -> FaultTable:
         stiff=is_stiff,
         homes_by_motor=False,
         start_speed=3.0,
+        may_fall=not hangs,
         joint=joint,
         phases={PLANNED_END: Lacks(hangs)} if hangs else {},
         may_not_show=_HANGING if hangs else {},

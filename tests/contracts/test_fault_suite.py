@@ -39,6 +39,14 @@ def judged(cell: Expected = CELL, **changed: Any) -> str:
     return "; ".join(complaints(replace(GOOD, **changed), RUNNING, cell, TABLE))
 
 
+def test_a_robot_that_may_fall_may_be_refused() -> None:
+    """It may lie on its side; if the next run begins, it is judged as any other."""
+    falls = replace(TABLE, may_fall=True)
+    refused, fast = replace(GOOD, next_began=False, next_reason="it leans"), replace(GOOD, next_speed=2.0)
+    assert complaints(refused, RUNNING, CELL, falls) == []
+    assert complaints(fast, RUNNING, CELL, falls) == ["the next run begins with 2.00 rad/s or m/s"]
+
+
 def test_a_single_cell_may_differ_from_its_row() -> None:
     """The others of the row stay, and a table without the cell too."""
     differs = replace(TABLE, cells={(FAULTS[0], RUNNING): Expected(end="goes on", why="a toy")})
