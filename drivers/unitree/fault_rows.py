@@ -21,6 +21,7 @@ from deal_hw.testing.fault_rows import (
     NOT_ARMED,
     PHASES,
     PLANNED_END,
+    RETURN_S,
     WAITS,
     Expected,
     FaultRig,
@@ -41,6 +42,21 @@ _HANGING: Final = {FROZEN: "limbs that hang free stay near the set-points of a s
 """What may not show on a stand or a crane, and why."""
 _RELEASED: Final = Expected(end="goes on", why="homing releases the robot's own controller")
 _SILENT: Final = Expected(end="goes on", why="homing waits until no other program commands for half a second")
+_PUSHED: Final = Expected(
+    end="passive",
+    within_s=RETURN_S,
+    since="return",
+    why="legs that another program moves push as on the floor: the run is refused",
+)
+_ON_LEGS: Final = {
+    (CUT, HOMING): Expected(
+        end="goes on", why="homing commands nothing, and waits longer than the fault lasts"
+    ),
+    (FROZEN, PLANNED_END): Expected(
+        end="passive or over", within_s=6.0, why="it shows when the robot lies down, at the end"
+    ),
+}
+"""Cells of a robot with four legs that differ."""
 _FOREIGN_HZ: Final = 47.0
 """No multiple of the control rate: in virtual time its commands would always come just before ours."""
 
@@ -116,6 +132,8 @@ def unitree_table(name: str, joint: str, hangs: str = "") -> FaultTable:
             (CLOCK_AHEAD, CONNECTING): NO_TIME_YET,
             (CLOCK_AHEAD, HOMING): NOT_ARMED,
             (CLOCK_BACK, CONNECTING): NO_TIME_YET,
+            **({} if hangs == ON_CRANE else _ON_LEGS),
+            **({(FOREIGN, CONNECTING): _PUSHED, (FOREIGN, HOMING): _PUSHED} if hangs == ON_STAND else {}),
         },
     )
 
