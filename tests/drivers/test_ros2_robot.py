@@ -197,7 +197,7 @@ def test_exchanged_joints_far_apart_stop_at_once(tmp_path: Path) -> None:
     rig = Ros2Rig(tmp_path, device_section={"joints": ("shoulder", "elbow")})
     rig.device.place(np.array([0.9, -0.3]))
     rig.robot.connect()
-    with pytest.raises(SafetyError, match=r"'elbow' does not follow: .*'shoulder'.* exchanged.* `joints` in"):
+    with pytest.raises(SafetyError, match=r"'shoulder' does not follow: .*'elbow'.* exchanged.* `joints` in"):
         rig.robot.home(20.0)
 
 
