@@ -158,7 +158,7 @@ def refine(
                 on_step = partial(_report, notify_step, shooting, done)
             point, normal, used = _solved(shooting, point, iterations, hopeless, on_step)
         done += used
-        found = _refined(shooting, point, normal, done)
+        found = refined_at(shooting, point, normal, done)
         if result is not None and not shooting.given and found.chi2 > WORSE * max(result.chi2, 1.0):
             if np.isfinite(found.chi2) and not shooting.contacts:
                 result = dataclasses.replace(result, refused=found)
@@ -197,7 +197,7 @@ def window_stages(problem: Problem) -> tuple[float, ...]:
 def refine_windows(shooting: Shooting, point: Point, iterations: int) -> Refined:
     """Refine from a point in its own windows, such as a part of all windows or weighted ones."""
     point, normal, used = _solved(shooting, point, iterations)
-    return _refined(shooting, point, normal, used)
+    return refined_at(shooting, point, normal, used)
 
 
 def _clear_gains(notify: Callable[[Refined], None]) -> Callable[[Refined], None]:
@@ -219,7 +219,7 @@ def _report(
     notify: Callable[[Refined], None], shooting: Shooting, done: int, point: Point, normal: Normal
 ) -> None:
     """Report an intermediate fit; a diverged one is none."""
-    found = _refined(shooting, point, normal, done)
+    found = refined_at(shooting, point, normal, done)
     if np.isfinite(found.chi2):
         notify(found)
 
@@ -237,7 +237,8 @@ def _solved(
     return solve(shooting, point, solver, notify)
 
 
-def _refined(shooting: Shooting, point: Point, normal: Normal, used: int) -> Refined:
+def refined_at(shooting: Shooting, point: Point, normal: Normal, used: int = 0) -> Refined:
+    """Return a point with its normal equations as a fit, after so many iterations."""
     chi2 = normal.cost / _degrees(shooting, normal)
     return Refined(shooting.theta(point), float(point.value[-1]), chi2, normal, point, shooting, used)
 
@@ -266,7 +267,7 @@ def at_parameters(
     else:
         point, normal = converged(shooting, point, START_ITERATIONS)
         point, normal = restarted(shooting, point, normal)
-    return dataclasses.replace(_refined(shooting, point, normal, 0), theta=theta, latency_s=latency_s)
+    return dataclasses.replace(refined_at(shooting, point, normal, 0), theta=theta, latency_s=latency_s)
 
 
 def _whole_step(

@@ -77,7 +77,7 @@ class SolverSettings:
 
     Attributes:
         iterations: Most steps.
-        converged: Relative decrease of the cost below which a step is the last.
+        converged: Relative decrease of the cost, reached or expected, below which a step is the last.
         reach: Width of a prior around the start, in the parameters' own scale, which holds insensitive
             parameters. It is as wide as a range of ratio 5, and moves with each new start.
         hopeless: Mean squared residual above which the solver is not started again.
@@ -165,7 +165,7 @@ def minimise(
         step = lsq_linear(rows, wanted, box, method="bvls", max_iter=10 * len(here)).x
         # The decrease that the model predicts, f(x) - m(d), against the one that comes, f(x) - f(x + d).
         expected = cost - float(np.sum((rows @ step - wanted) ** 2))
-        if not expected > 0:
+        if not expected > settings.converged * cost:
             if carried:
                 by = None
                 continue

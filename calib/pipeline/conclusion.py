@@ -53,7 +53,7 @@ def conclude_fit(
     if problem.fixed_latency_s is None and not doubt and allowed.delays_are_whole:
         scan = scan_latency(problem, fit, run.progress)
         # Whole ticks that have not converged decide nothing: the free latency is kept.
-        whole = scan if scan.decides(fit) else None
+        whole = scan if scan is not None and scan.decides(fit) else None
     if whole is not None:
         fit = plain = whole.refined[whole.best]
     decided = whole is not None or problem.fixed_latency_s is not None

@@ -1,8 +1,8 @@
 """Checks after a fit: which ones run, what they change of its uncertainty, and what they report.
 
-Split-half check: two halves of the data, each refined alone from the estimate on all, must agree. The halves
+Split-half check: two halves of the data, each fitted alone from the estimate on all, must agree. The halves
 are alternating blocks of the refinement's own windows. So no sample is predicted in both, and both hold every
-phase of the motion. It costs less than one stage of the refinement.
+phase of the motion. The fit of a half is one step in residuals that are linearised already.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from deal_hw.calib.fit.intervals import (
     wider_latency,
     with_rows,
 )
-from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows
-from deal_hw.calib.fit.residual import Point, Shooting
+from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows, refined_at
+from deal_hw.calib.fit.residual import Normal, Point, Shooting, WindowRows, value_bounds
+from deal_hw.calib.fit.solver import LATENCY_UNIT_S
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
@@ -48,6 +49,12 @@ MOST_CAUSES = 2
 
 HALF_ITERATIONS = 6
 """Most iterations of each half's fit."""
+
+KEPT_DECREASE = 0.5
+"""Share of the expected decrease of a half's cost from which on its linear step is its fit [-]."""
+
+NEGLIGIBLE_DECREASE = 1.0
+"""Expected decrease that needs no such proof [noise variances]: less than one standard deviation."""
 
 FEWEST_WINDOWS = 4
 """Fewest windows that are halved."""
@@ -390,9 +397,9 @@ FAILED = SplitHalf(note="the check failed")
 def check_split_half(
     problem: Problem, refined: Refined, known: Uncertainty, allows: Allows = all_allowed
 ) -> SplitHalf:
-    """Refine two halves of the windows alone and compare with ``refined``, the latency where that is free.
+    """Fit two halves of the windows alone and compare with ``refined``, the latency where that is free.
 
-    Parameters that ``known`` calls unidentified are not compared.
+    ``refined`` has linearised residuals. Parameters that ``known`` calls unidentified are not compared.
     """
     shooting = refined.shooting
     windows = sum(len(d.windows) for d in shooting.data)
@@ -410,8 +417,8 @@ def check_split_half(
     latency_s = None if shooting.fixed_latency else refined.latency_s
     fits, halves = [], []
     for half in range(2):
-        found = refine_windows(*half_of(shooting, refined.point, half, block), HALF_ITERATIONS)
-        own = uncertainty_at(problem, with_rows(found), fixed_latency=latency_s is None)
+        found = _fit_of_half(refined, half, block)
+        own = uncertainty_at(problem, found, fixed_latency=latency_s is None)
         # A half holds few blocks: the clustering of all blocks holds for it, too.
         std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
         fits.append((found.theta, found.latency_s))
@@ -482,21 +489,72 @@ def widened_by_split_half(
     return wider.with_alarms(last=split.alarms(known.space))
 
 
-def half_of(shooting: Shooting, point: Point, half: int, block: int) -> tuple[Shooting, Point]:
-    """Return every other block of the windows, from block ``half``, and the point in them.
+def _fit_of_half(refined: Refined, half: int, block: int) -> Refined:
+    """Return the fit of a half of the windows, with linearised residuals.
+
+    It is one step of least squares from the fit of all, in the residuals that are linearised there: it costs
+    as much as some predictions, and a refinement as much as all parameters. Where the step does not lower
+    the half's cost as it should, residuals bend too much, and the half is refined.
+    """
+    fit = half_of(refined, half, block)
+    shooting, point, normal = fit.shooting, fit.point, fit.normal
+    # |r + J d|^2 + |hold d|^2 with J^T J = H and J^T r = g, in the bounds; the hold is that of the solver.
+    unit = np.ones(len(point.value))
+    unit[-1] = LATENCY_UNIT_S
+    free = np.append(np.ones(len(unit) - 1, dtype=bool), not shooting.fixed_latency)
+    root = np.linalg.cholesky((normal.hessian + np.diag(unit**-2))[np.ix_(free, free)])
+    wanted = -scipy.linalg.solve_triangular(root, normal.gradient[free], lower=True)
+    low, high = (np.minimum(end - point.value, 0.0)[free] for end in value_bounds(shooting.problem))
+    step = np.zeros_like(point.value)
+    step[free] = scipy.optimize.lsq_linear(root.T, wanted, (low, high), method="bvls").x
+    moved = shooting.followed(point, normal, step)
+    slope = normal.hessian @ step
+    expected = -float(step @ (2 * normal.gradient + slope))
+    cost = shooting.cost(moved)
+    if expected > NEGLIGIBLE_DECREASE and not normal.cost - cost > KEPT_DECREASE * expected:
+        return with_rows(refine_windows(shooting, point, HALF_ITERATIONS))
+    rows = tuple(dataclasses.replace(r, residual=r.rest + r.following @ step) for r in normal.rows)
+    there = dataclasses.replace(
+        normal,
+        cost=cost,
+        gradient=normal.gradient + slope,
+        residual=tuple(shooting.residuals(moved)),
+        rows=rows,
+    )
+    return refined_at(shooting, moved, there)
+
+
+def half_of(refined: Refined, half: int, block: int) -> Refined:
+    """Return a fit, which has linearised residuals, in every other block of its windows, from ``half`` on.
 
     The count of windows continues over recordings.
     """
-    data, position, velocity, first = [], [], [], 0
+    shooting, point, normal = refined.shooting, refined.point, refined.normal
+    data, position, velocity, residual, back, rows = [], [], [], [], [], []
+    first, K = 0, len(point.value)
+    expected = point.value - shooting.prior_mean
+    hessian, gradient = np.diag(normal.prior), normal.prior * expected
+    cost, count = float(gradient @ expected), 0
     for e, of_episode in enumerate(shooting.data):
         number = (first + np.arange(len(of_episode.windows))) // block
         first += len(of_episode.windows)
         mine = number % 2 == half
-        if mine.any():
-            data.append(taken(of_episode, mine))
-            position.append(point.position[e][mine])
-            velocity.append(point.velocity[e][mine])
-    return shooting.on(data), Point(point.value, tuple(position), tuple(velocity))
+        if not mine.any():
+            continue
+        data.append(taken(of_episode, mine))
+        position.append(point.position[e][mine])
+        velocity.append(point.velocity[e][mine])
+        residual.append(normal.residual[e][mine])
+        back.append(tuple(part[mine] for part in normal.back[e]))
+        whole = normal.rows[e]
+        rows.append(WindowRows(whole.residual[mine], whole.parameter[mine], whole.start[mine]))
+        by = rows[-1].following.reshape(-1, K)
+        hessian = hessian + by.T @ by
+        gradient = gradient + by.T @ rows[-1].residual.ravel()
+        cost += float(np.sum(rows[-1].residual ** 2))
+        count += int(np.count_nonzero(data[-1].reported) if shooting.given else np.sum(data[-1].freedom))
+    there = Normal(cost, count, hessian, gradient, tuple(residual), normal.prior, tuple(back), tuple(rows))
+    return refined_at(shooting.on(data), Point(point.value, tuple(position), tuple(velocity)), there)
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:

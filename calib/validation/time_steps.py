@@ -80,11 +80,12 @@ class LatencyScan:
         return self.refined[self.best].normal.cost < free.normal.cost + WORSE
 
 
-def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback | None) -> LatencyScan:
+def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback | None) -> LatencyScan | None:
     """Refine again at the whole device ticks around the estimated latency.
 
     The device acts on period boundaries, so its latency is a whole number of ticks. Knowing that sharpens the
-    other parameters; the ticks that remain plausible show by how much.
+    other parameters; the ticks that remain plausible show by how much. Where the recordings put the latency
+    between two ticks, as with commands that come at any time, no tick is worth a fit, and there is no scan.
     """
     tick = problem.episodes[0].step_s
     centre = round(refined.latency_s / tick)
@@ -97,13 +98,15 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
         # In a smooth problem the curvature shows up to which distance a tick is worth a fit.
         variance = np.linalg.inv(_information(refined))[-1, -1]
         worth_s = np.sqrt(HOPELESS * max(1.0, refined.chi2) * variance)
-        low = max(low, min(math.ceil((refined.latency_s - worth_s) / tick), centre))
-        high = min(high, max(math.floor((refined.latency_s + worth_s) / tick), centre))
+        low = max(low, math.ceil((refined.latency_s - worth_s) / tick))
+        high = min(high, math.floor((refined.latency_s + worth_s) / tick))
     found: dict[int, Refined] = {}
     if problem.noise_free:
         # The given refinement is at a whole tick, with more iterations than its neighbours get.
         found[centre] = refined
     waiting = [t for t in range(centre - reach, centre + reach + 1) if low <= t <= high and t not in found]
+    if not waiting and not found:
+        return None
     shooting = refined.shooting.on(refined.shooting.data, fixed_latency=True)
     while waiting and len(found) < MOST_TICKS:
         t = waiting.pop(0)

@@ -10,7 +10,7 @@ import pytest
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.data.resume import Restarts
-from deal_hw.calib.fit.intervals import Uncertainty, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import NEAR_STRETCH, Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
@@ -34,14 +34,20 @@ from deal_hw.findings import SafeChecks
 
 def test_halves_share_no_window_and_hold_all(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """Blocks of two windows go to either half in turn, with their start states."""
-    halves = [half_of(noisy_refined.shooting, noisy_refined.point, half, 2) for half in range(2)]
-    starts = [set(s.data[0].windows.start.tolist()) for s, _ in halves]
+    whole_fit = with_rows(noisy_refined)
+    halves = [half_of(whole_fit, half, 2) for half in range(2)]
+    starts = [set(h.shooting.data[0].windows.start.tolist()) for h in halves]
     assert not starts[0] & starts[1]
     assert starts[0] | starts[1] == set(noisy_refined.shooting.data[0].windows.start.tolist())
     whole = noisy_refined.shooting.cost(noisy_refined.point)
-    assert sum(s.cost(p) for s, p in halves) == pytest.approx(whole)
-    first = halves[0][0].data[0]
-    assert len(first.measured) == len(first.windows) == len(halves[0][1].position[0])
+    assert sum(h.shooting.cost(h.point) for h in halves) == pytest.approx(whole)
+    first = halves[0].shooting.data[0]
+    assert len(first.measured) == len(first.windows) == len(halves[0].point.position[0])
+    for half in halves:
+        alone = half.shooting.normal(half.point, stretch=NEAR_STRETCH, central=True)
+        assert (half.normal.cost, half.normal.count) == (pytest.approx(alone.cost), alone.count)
+        np.testing.assert_allclose(half.normal.hessian, alone.hessian, rtol=1e-6)
+        np.testing.assert_allclose(half.normal.gradient, alone.gradient, rtol=1e-6, atol=1e-6)
 
 
 def test_halves_of_a_right_model_agree(noisy_problem: Problem, noisy_refined: Refined) -> None:
