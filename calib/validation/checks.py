@@ -29,9 +29,9 @@ from deal_hw.calib.fit.intervals import (
     wider_latency,
     with_rows,
 )
+from deal_hw.calib.fit.one_step import of_rows, one_step
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows, refined_at
-from deal_hw.calib.fit.residual import Normal, Point, Shooting, WindowRows, value_bounds
-from deal_hw.calib.fit.solver import LATENCY_UNIT_S
+from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
@@ -49,12 +49,6 @@ MOST_CAUSES = 2
 
 HALF_ITERATIONS = 6
 """Most iterations of each half's fit."""
-
-KEPT_DECREASE = 0.5
-"""Share of the expected decrease of a half's cost from which on its linear step is its fit [-]."""
-
-NEGLIGIBLE_DECREASE = 1.0
-"""Expected decrease that needs no such proof [noise variances]: less than one standard deviation."""
 
 FEWEST_WINDOWS = 4
 """Fewest windows that are halved."""
@@ -417,7 +411,9 @@ def check_split_half(
     latency_s = None if shooting.fixed_latency else refined.latency_s
     fits, halves = [], []
     for half in range(2):
-        found = _fit_of_half(refined, half, block)
+        part = half_of(refined, half, block)
+        # Where residuals bend too much for one step, the half is refined.
+        found = one_step(part) or with_rows(refine_windows(part.shooting, part.point, HALF_ITERATIONS))
         own = uncertainty_at(problem, found, fixed_latency=latency_s is None)
         # A half holds few blocks: the clustering of all blocks holds for it, too.
         std = np.sqrt(np.diag(own.covariance)) * np.maximum(known.widened / own.widened, 1.0)
@@ -489,41 +485,6 @@ def widened_by_split_half(
     return wider.with_alarms(last=split.alarms(known.space))
 
 
-def _fit_of_half(refined: Refined, half: int, block: int) -> Refined:
-    """Return the fit of a half of the windows, with linearised residuals.
-
-    It is one step of least squares from the fit of all, in the residuals that are linearised there: it costs
-    as much as some predictions, and a refinement as much as all parameters. Where the step does not lower
-    the half's cost as it should, residuals bend too much, and the half is refined.
-    """
-    fit = half_of(refined, half, block)
-    shooting, point, normal = fit.shooting, fit.point, fit.normal
-    # |r + J d|^2 + |hold d|^2 with J^T J = H and J^T r = g, in the bounds; the hold is that of the solver.
-    unit = np.ones(len(point.value))
-    unit[-1] = LATENCY_UNIT_S
-    free = np.append(np.ones(len(unit) - 1, dtype=bool), not shooting.fixed_latency)
-    root = np.linalg.cholesky((normal.hessian + np.diag(unit**-2))[np.ix_(free, free)])
-    wanted = -scipy.linalg.solve_triangular(root, normal.gradient[free], lower=True)
-    low, high = (np.minimum(end - point.value, 0.0)[free] for end in value_bounds(shooting.problem))
-    step = np.zeros_like(point.value)
-    step[free] = scipy.optimize.lsq_linear(root.T, wanted, (low, high), method="bvls").x
-    moved = shooting.followed(point, normal, step)
-    slope = normal.hessian @ step
-    expected = -float(step @ (2 * normal.gradient + slope))
-    cost = shooting.cost(moved)
-    if expected > NEGLIGIBLE_DECREASE and not normal.cost - cost > KEPT_DECREASE * expected:
-        return with_rows(refine_windows(shooting, point, HALF_ITERATIONS))
-    rows = tuple(dataclasses.replace(r, residual=r.rest + r.following @ step) for r in normal.rows)
-    there = dataclasses.replace(
-        normal,
-        cost=cost,
-        gradient=normal.gradient + slope,
-        residual=tuple(shooting.residuals(moved)),
-        rows=rows,
-    )
-    return refined_at(shooting, moved, there)
-
-
 def half_of(refined: Refined, half: int, block: int) -> Refined:
     """Return a fit, which has linearised residuals, in every other block of its windows, from ``half`` on.
 
@@ -531,10 +492,7 @@ def half_of(refined: Refined, half: int, block: int) -> Refined:
     """
     shooting, point, normal = refined.shooting, refined.point, refined.normal
     data, position, velocity, residual, back, rows = [], [], [], [], [], []
-    first, K = 0, len(point.value)
-    expected = point.value - shooting.prior_mean
-    hessian, gradient = np.diag(normal.prior), normal.prior * expected
-    cost, count = float(gradient @ expected), 0
+    first, count = 0, 0
     for e, of_episode in enumerate(shooting.data):
         number = (first + np.arange(len(of_episode.windows))) // block
         first += len(of_episode.windows)
@@ -545,16 +503,17 @@ def half_of(refined: Refined, half: int, block: int) -> Refined:
         position.append(point.position[e][mine])
         velocity.append(point.velocity[e][mine])
         residual.append(normal.residual[e][mine])
-        back.append(tuple(part[mine] for part in normal.back[e]))
+        gain, shift = normal.back[e]
+        back.append((gain[mine], shift[mine]))
         whole = normal.rows[e]
         rows.append(WindowRows(whole.residual[mine], whole.parameter[mine], whole.start[mine]))
-        by = rows[-1].following.reshape(-1, K)
-        hessian = hessian + by.T @ by
-        gradient = gradient + by.T @ rows[-1].residual.ravel()
-        cost += float(np.sum(rows[-1].residual ** 2))
         count += int(np.count_nonzero(data[-1].reported) if shooting.given else np.sum(data[-1].freedom))
-    there = Normal(cost, count, hessian, gradient, tuple(residual), normal.prior, tuple(back), tuple(rows))
-    return refined_at(shooting.on(data), Point(point.value, tuple(position), tuple(velocity)), there)
+    part = shooting.on(data)
+    there = Point(point.value, tuple(position), tuple(velocity))
+    cost = float(normal.prior @ (point.value - shooting.prior_mean) ** 2)
+    cost += sum(float(np.sum(r.residual**2)) for r in rows)
+    kept = dataclasses.replace(normal, cost=cost, count=count, residual=tuple(residual), back=tuple(back))
+    return refined_at(part, there, of_rows(part, there, kept, tuple(rows)))
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:
