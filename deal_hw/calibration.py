@@ -127,6 +127,7 @@ class CalibrationResult:
         population: The last population, (N, K), or None.
         verdicts: How well the data determine each parameter.
         null_directions: Combinations that the data do not determine, as text.
+        prior_directions: Combinations that an expected value determines more than the data, as text.
         latency_s: Total latency found, or given [s].
         latency_interval_s: 90 % interval of the latency [s].
         chi2: Mean squared residual over its expected variance; 1 is a perfect model.
@@ -154,6 +155,7 @@ class CalibrationResult:
     population: FloatArray | None = None
     verdicts: tuple[Identifiability, ...] = ()
     null_directions: tuple[str, ...] = ()
+    prior_directions: tuple[str, ...] = ()
     latency_s: float = 0.0
     latency_interval_s: tuple[float, float] = (0.0, 0.0)
     chi2: float = float("nan")
@@ -239,6 +241,7 @@ class CalibrationResult:
             "known": self.space.known,
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "null_directions": list(self.null_directions),
+            "prior_directions": list(self.prior_directions),
             "latency_s": self.latency_s,
             "latency_interval_s": list(self.latency_interval_s),
             "chi2": self.chi2,
@@ -288,6 +291,7 @@ class CalibrationResult:
             covariance=None if found.covariance is None else covariance_of(found.covariance, space),
             verdicts=tuple(row.verdict for row in rows if row.verdict is not None),
             null_directions=found.null_directions,
+            prior_directions=found.prior_directions,
             latency_s=number(found.latency_s, "latency_s", 0.0, LONGEST_LATENCY_S),
             latency_interval_s=(float(low_s), float(high_s)),
             chi2=_number(found.chi2),
@@ -437,6 +441,7 @@ class _ResultFile:
     provenance: _Provenance
     biased: dict[str, str] = field(default_factory=dict)
     known: dict[str, float] | None = None
+    prior_directions: tuple[str, ...] = ()
     # Results from before advice and unchecked results existed have neither.
     advice: tuple[_Advice, ...] = ()
     unchecked: bool = False

@@ -263,6 +263,7 @@ class _MultiStart(Stepper):
             covariance=known.covariance,
             verdicts=known.verdicts,
             null_directions=known.null_directions,
+            prior_directions=known.prior_directions,
             latency_interval_s=known.latency_interval_s,
         )
 

@@ -119,6 +119,7 @@ class Uncertainty:
         interval: 90 % intervals, physical, (K, 2).
         latency_interval_s: 90 % interval of the latency [s].
         null_directions: Combinations without effect on the recordings, in words.
+        prior_directions: Combinations of which a prior says more than the recordings, in words.
         alarms: Signs that the model is wrong.
         inflation: Factor on the variance for model error.
         blind: Parameters that the data do not determine: their interval is the range's own, (K,).
@@ -143,6 +144,7 @@ class Uncertainty:
     clustered: Clustered | None
     widened: FloatArray
     biased: Mapping[str, str] = field(default_factory=dict)
+    prior_directions: tuple[str, ...] = ()
 
     @property
     def verdicts(self) -> tuple[Identifiability, ...]:
@@ -284,10 +286,8 @@ def uncertainty(
         covariance=covariance[:K, :K],
         interval=intervals(space, theta, covariance[:K, :K], blind, bound),
         latency_interval_s=latency,
-        null_directions=(
-            *null_directions(space, unseen),
-            *expected_directions(space, data[:K, :K] / inflation),
-        ),
+        null_directions=null_directions(space, unseen),
+        prior_directions=expected_directions(space, data[:K, :K] / inflation, covariance[:K, :K]),
         alarms=_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
         inflation=inflation,
         blind=blind,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calibration import LATENCY
+from deal_hw.calibration import LATENCY, Z90, listed, percent
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
 
@@ -37,6 +37,12 @@ variance comes from the other."""
 
 MOSTLY = 2.0
 """From this factor on, three quarters of the variance, they are confounded; below it partly [-]."""
+
+ALIKE = 0.8
+"""Least change, as a share of the largest, of a parameter that scales with others [-]."""
+
+FEWEST_OF_A_SCALE = 3
+"""Fewest parameters whose common factor is called a scale."""
 
 MOST_COMBINED = 8
 """Most combinations that are described of those that a prior decides: whole inertias have dozens."""
@@ -132,15 +138,17 @@ def null_directions(space: ParameterSpace, unseen: NullSpace) -> tuple[str, ...]
     return (*words, f"{', '.join(alone)} {leave} no trace in this recording: {ask}")
 
 
-def expected_directions(space: ParameterSpace, data: FloatArray) -> tuple[str, ...]:
+def expected_directions(space: ParameterSpace, data: FloatArray, covariance: FloatArray) -> tuple[str, ...]:
     """Describe the combinations of parameters of which a prior says more than the data.
 
     Of the ten inertial parameters of each link of a robot on a fixed base, some act only together with those
-    of other links, and some not at all. With a CAD model as prior each has a value nevertheless.
+    of other links, and some not at all. With a CAD model as prior each has a value nevertheless. And no
+    motion shows the common scale of all masses, frictions and gains.
 
     Args:
         space: The parameters.
         data: Information of the data alone in each parameter's own scale, (K, K).
+        covariance: Of the estimate, in the same scale, (K, K).
     """
     std = space.prior[1]
     known, free = np.flatnonzero(np.isfinite(std)), np.flatnonzero(~np.isfinite(std))
@@ -155,6 +163,11 @@ def expected_directions(space: ParameterSpace, data: FloatArray) -> tuple[str, .
     combined: dict[str, None] = {}
     alone: list[str] = []
     for direction in sparse_basis(vectors[:, values < 1.0].T):
+        moved = np.zeros(len(space))
+        moved[known] = direction * std[known]
+        if (words := _common_scale(space, moved, covariance)) is not None:
+            combined[words] = None
+            continue
         share = direction / np.max(np.abs(direction))
         parts = [int(k) for k in np.argsort(-np.abs(share)) if abs(share[k]) > 2 * NAMED_PART]
         names = [space.names[known[k]] for k in parts]
@@ -167,6 +180,28 @@ def expected_directions(space: ParameterSpace, data: FloatArray) -> tuple[str, .
     if not alone:
         return tuple(combined)
     return (*combined, f"{', '.join(dict.fromkeys(alone))}: the prior says more than the recordings")
+
+
+def _common_scale(space: ParameterSpace, moved: FloatArray, covariance: FloatArray) -> str | None:
+    """Describe a direction, (K,) in each parameter's own scale, that is a common factor; else return None."""
+    share = moved / moved[np.argmax(np.abs(moved))]
+    together = np.flatnonzero((share > ALIKE) & space.log_scale)
+    if len(together) < FEWEST_OF_A_SCALE or np.any(np.abs(np.delete(share, together)) > NAMED_PART):
+        return None
+    ratios = np.eye(len(together)) - 1 / len(together)
+    of_them = covariance[np.ix_(together, together)]
+    spread = np.diag(ratios @ of_them @ ratios)
+    reach = np.expm1(Z90 * float(np.sqrt(np.mean(of_them))))
+    # What shows the scale best is what is known best beside it; a mass is the easiest to measure.
+    names = [space.names[k] for k in together]
+    masses = [i for i, k in enumerate(together) if space.free[k].kind == "body_mass"]
+    best = min(masses or range(len(together)), key=lambda i: spread[i])
+    measure = f"weigh {space.free[together[best]].elements[0]}" if masses else f"measure {names[best]}"
+    return (
+        f"the common scale of {listed(names)}: no motion shows it, so what was expected holds it, to "
+        f"+-{percent(reach)}. The recordings show the ratios. To know the scale, {measure} (--known "
+        f"{names[best]} VALUE)"
+    )
 
 
 def _describe(space: ParameterSpace, direction: FloatArray, parts: list[int]) -> str:

@@ -63,6 +63,10 @@ VELOCITY_STEP = 1e-4
 CONTACT_STATE_STEP = 0.5
 """The same of start states with feet on the floor, in standard deviations of the smoothed ones."""
 
+LEAST_INFORMATION = 1e-9
+"""Least information on a start state [1 / unit²]: that of a standard deviation of 30,000 rad, or m, or a
+second's."""
+
 States = list[tuple[FloatArray, FloatArray]]
 """Positions and velocities at every sample of each episode, (T, C) each."""
 
@@ -213,7 +217,8 @@ class Shooting:
         centre = own * space.to_scale(mean) + around * space.to_scale(space.nominal)
         self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
         C = problem.coordinates
-        self.start_information = [1 / d.prior_std**2 for d in self.data]
+        # Where a window diverges whatever its start, nothing else is left to say where it starts.
+        self.start_information = [np.maximum(1 / d.prior_std**2, LEAST_INFORMATION) for d in self.data]
         self._parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
         kinds = {p.kind for p in problem.space.parameters}

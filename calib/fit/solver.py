@@ -165,7 +165,8 @@ def minimise(
         step = lsq_linear(rows, wanted, box, method="bvls", max_iter=10 * len(here)).x
         # The decrease that the model predicts, f(x) - m(d), against the one that comes, f(x) - f(x + d).
         expected = cost - float(np.sum((rows @ step - wanted) ** 2))
-        if not expected > settings.converged * cost:
+        # Carried derivatives do not show that nothing is left to gain. A step with them does, for little.
+        if not expected > (0.0 if carried else settings.converged * cost):
             if carried:
                 by = None
                 continue

@@ -244,6 +244,7 @@ class CalibrationRun:
             covariance=known.covariance,
             verdicts=known.verdicts,
             null_directions=known.null_directions,
+            prior_directions=known.prior_directions,
             latency_s=fit.latency_s,
             latency_interval_s=known.latency_interval_s,
             chi2=chi2,

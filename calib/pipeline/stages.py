@@ -193,6 +193,7 @@ class CalibrationPipeline(CalibrationMethod[Problem]):
             covariance=known.covariance,
             verdicts=known.verdicts,
             null_directions=known.null_directions,
+            prior_directions=known.prior_directions,
             latency_s=found.latency_s,
             latency_interval_s=known.latency_interval_s,
             chi2=found.chi2,

@@ -146,7 +146,10 @@ def _judged(result: CalibrationResult) -> Trust:
         return Trust(
             "amber", f"{gain} {noise}", "No recording shows whether the model holds on other motion.", record
         )
-    return Trust("green", f"{gain} {noise}", "The remaining error is the sensor's noise.", "Use it.")
+    means = "The remaining error is the sensor's noise."
+    if result.prior_directions:
+        means += " Where expected values say more than the recordings, that is named below."
+    return Trust("green", f"{gain} {noise}", means, "Use it.")
 
 
 def _of_distributions(result: CalibrationResult) -> Trust | None:

@@ -155,6 +155,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     Console(width=max(console.width, TABLE_WIDTH)).print(table)
     for words in result.null_directions:
         console.print(f"the data do not determine: {words}")
+    for words in result.prior_directions:
+        console.print(words)
     dataset = result.provenance.get("dataset", "runs/first/dataset")
     # What a recording would tell was predicted by a model that does not explain this one.
     first = "next, after the causes that alarms name" if result.chi2 > MISMATCH_CHI2 else "next"

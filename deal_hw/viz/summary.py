@@ -148,4 +148,5 @@ def _verdict(result: CalibrationResult) -> str:
     ]
     lines = ["**Alarms.**", "", *lines, ""] if lines else []
     lines += [f"- not determined by the data: {direction}" for direction in result.null_directions]
+    lines += [f"- {direction}" for direction in result.prior_directions]
     return "\n".join(lines)

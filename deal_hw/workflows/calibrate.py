@@ -129,7 +129,7 @@ class Calibration:
         found = trust(self.result)
         unknown = [f"the data do not determine: {words}" for words in self.result.null_directions]
         alarms = [f"alarm: {alarm}" for alarm in self.result.alarms]
-        return [f"{found.colour}: {found.sentence}", *unknown, *alarms]
+        return [f"{found.colour}: {found.sentence}", *unknown, *self.result.prior_directions, *alarms]
 
     def __repr__(self) -> str:
         return f"<Calibration of {len(self.result.space)} parameters, {self.colour}; table() shows them>"

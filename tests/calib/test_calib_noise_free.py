@@ -71,7 +71,7 @@ def test_the_scan_takes_the_refinement_itself_at_its_own_step(seen: Seen) -> Non
     problem = Problem(seen.robot, seen.space, [seen.episode], threads=1)
     found = refine(problem, seen.truth * 1.05, 0.0)
     scan = scan_latency(problem, found, None)
-    assert scan.ticks == (0, 1)
+    assert scan is not None and scan.ticks == (0, 1)
     assert scan.refined[0] is found
     np.testing.assert_allclose(scan.weights, [1.0, 0.0], atol=1e-12)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,6 +63,7 @@ def test_a_scan_of_the_latency_ends_where_each_tick_fitted_alone_ends(
     problem = small_problem(latency_ticks=3, fixed_latency_s=None)
     free = refine(problem, problem.space.nominal, 0.004, (0.2,))
     scan = scan_latency(problem, free, None)
+    assert scan is not None
     tick_s = problem.episodes[0].step_s
     for tick, found in zip(scan.ticks, scan.refined, strict=True):
         start = free.shooting.start(free.theta, tick * tick_s)
@@ -79,7 +81,7 @@ def test_a_start_state_behind_a_kink_starts_again(tmp_path: Path) -> None:
     model, paths, held_out = write(robot, tmp_path, seconds=3.0)
     work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
-    theta = np.array([robot.truth[name] for name in problem.space.names])
+    theta = np.array([robot.truth.get(p.name, p.nominal) for p in problem.space])
     right = at_parameters(problem, theta, robot.delay_s, 40)
     states = right.shooting.states(right.point)
     disturbed = [(x - 0.02, v - 0.6 * np.sign(v)) for x, v in states]
@@ -135,7 +137,7 @@ TWO = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
 
 @pytest.mark.parametrize("central", [False, True])
 def test_independent_pendulums_share_simulations(tmp_path: Path, central: bool) -> None:
-    """Eight parameters, a latency and four entries of start states: 7 simulations instead of 13."""
+    """Ten parameters, a latency and four entries of start states: 8 simulations instead of 15."""
     model, rng = mujoco.MjModel.from_xml_string(TWO), np.random.default_rng(0)
     data, rows = mujoco.MjData(model), []
     for k in range(250):
@@ -150,7 +152,7 @@ def test_independent_pendulums_share_simulations(tmp_path: Path, central: bool) 
     )
     work = calibration_input(settings)
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
-    assert problem.trees[0].tolist() == [0, 1] and len(problem.space) == 8
+    assert problem.trees[0].tolist() == [0, 1] and len(problem.space) == 10
     alone = copy.copy(problem)
     alone.trees = [np.zeros(2, dtype=np.int64)]
     steps, found = [], []
@@ -161,7 +163,15 @@ def test_independent_pendulums_share_simulations(tmp_path: Path, central: bool) 
         before = of.steps
         found.append(shooting.normal(point, keep=True, central=central))
         steps.append(of.steps - before)
-    assert steps[0] * 13 == steps[1] * 7
+    assert steps[0] * 15 == steps[1] * 8
     together, apart = (f.rows[0] for f in found)
     for mine, other in ((together.parameter, apart.parameter), (together.start, apart.start)):
         np.testing.assert_allclose(mine, other, rtol=1e-6, atol=1e-6 * np.abs(other).max())
+
+
+def test_between_two_ticks_there_is_no_scan(small_problem: Callable[..., Problem]) -> None:
+    """The latency's curvature says how many standard deviations the nearest whole tick is away: over ten."""
+    problem = small_problem(latency_ticks=3, fixed_latency_s=None)
+    free = refine(problem, problem.space.nominal, 0.004, (0.2,))
+    between = dataclasses.replace(free, latency_s=2.5 * problem.episodes[0].step_s)
+    assert scan_latency(problem, between, None) is None

@@ -22,6 +22,7 @@ from deal_hw.sim.parameters import (
     check_space,
     find_kind,
 )
+from deal_hw.sim.parameters.doubts import DOUBTS
 from deal_hw.sim.parameters.fields import BatchFields, ModelFields
 from deal_hw.sim.parameters.geom import bounce, damping_ratio, restitution_of
 from deal_hw.sim.parameters.laws import FRICTION_KINDS, SERVO_LAW_KINDS
@@ -425,6 +426,16 @@ def test_every_kind_has_its_row_in_the_docs() -> None:
         wanted = [kind.element, kind.unit, "see below" if name == "body_scale" else fields, kind.along]
         assert rows[name] == wanted
     assert all(f"`{field}`" in text for field in KIND_TABLE["body_scale"].writes)
+
+
+def test_every_doubt_has_its_row_in_the_docs() -> None:
+    """Width and source are those of the table."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "parameters.md"
+    part = page.read_text(encoding="utf-8").split("## What is expected")[1].split("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in part.splitlines() if line.startswith("| `")]
+    assert {name.strip("`"): (float(std.split()[0]), source) for name, std, source in rows} == {
+        name: (doubt.std, doubt.source) for name, doubt in DOUBTS.items()
+    }
 
 
 def test_the_set_of_a_dynamixel_servo_in_the_docs_can_be_searched() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,6 +15,8 @@ from hypothesis import strategies as st
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
+from deal_hw.sim.parameters import KIND_TABLE, with_doubts, with_usual_range
+from deal_hw.sim.parameters.doubts import DOUBTS
 from deal_hw.sim.parameters.template import left_at_zero, template
 from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
@@ -25,12 +28,12 @@ def _entry(text: str) -> ParameterSpace:
 
 
 def test_pattern_each_gives_one_parameter_an_element_with_the_models_value() -> None:
-    """Four hips, nominal 0.6 from the MJCF, a factor 5 to either side: 0.12 to 3."""
+    """Four hips, nominal 0.6 from the MJCF, a factor 10 to either side: 0.06 to 6."""
     space = _entry("kind: dof_damping, elements: '*_hip_joint'")
     assert space.names == tuple(f"{leg}_hip_joint.damping" for leg in ("FL", "FR", "RL", "RR"))
     p = space["FL_hip_joint.damping"]
     assert (p.nominal, p.unit, p.scale) == (0.6, "N·m·s/rad", "log")
-    assert (p.low, p.high) == pytest.approx((0.12, 3.0))
+    assert (p.low, p.high) == pytest.approx((0.06, 6.0))
 
 
 def test_dry_friction_is_searched_wider() -> None:
@@ -145,13 +148,20 @@ def test_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         read_space(tmp_path / "absent.yaml", MODEL)
 
 
-def test_template_parses_to_friction_damping_armature_and_stiffness(tmp_path: Path) -> None:
-    """12 joints x 4; the servo's damping is left out, as it adds to the joint's."""
+def test_template_parses_to_all_that_an_owner_doubts(tmp_path: Path) -> None:
+    """12 joints x 5 and 13 bodies. A joint's damping adds to its servo's, which is larger: it is left out."""
     path = tmp_path / "params.yaml"
     path.write_text(template(MODEL, "go2.xml"), encoding="utf-8")
     space = read_space(path, MODEL)
-    assert len(space) == 48
-    assert {p.kind for p in space} == {"dof_frictionloss", "dof_damping", "dof_armature", "servo_stiffness"}
+    assert len(space) == 73
+    assert {p.kind for p in space} == {
+        "dof_frictionloss",
+        "servo_damping",
+        "dof_armature",
+        "servo_stiffness",
+        "body_mass",
+        "encoder_bias",
+    }
 
 
 def test_every_line_of_the_template_can_be_switched_on() -> None:
@@ -165,8 +175,9 @@ def test_every_line_of_the_template_can_be_switched_on() -> None:
 def test_what_is_zero_is_not_searched_and_is_named() -> None:
     """No ratio leads away from 0. A servo's kv is a joint's damping; a plain joint has none."""
     model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><body><joint name="knee" armature="0.1"/><geom size="1"/>
-        <body><joint name="foot" damping="0.2" frictionloss="0.1"/><geom size="1"/></body></body></worldbody>
+        """<mujoco><worldbody><body name="thigh"><joint name="knee" armature="0.1"/><geom size="1"/>
+        <body name="shank"><joint name="foot" damping="0.2" frictionloss="0.1"/><geom size="1"/></body></body>
+        </worldbody>
         <actuator><position name="m" joint="knee" kp="9" kv="1"/></actuator></mujoco>"""
     )
     assert left_at_zero(model) == {"dof_frictionloss": ["knee"], "dof_armature": ["foot"]}
@@ -176,6 +187,10 @@ def test_what_is_zero_is_not_searched_and_is_named() -> None:
         "knee.armature",
         "m.servo_stiffness",
         "m.servo_damping",
+        "thigh.mass",
+        "shank.mass",
+        "knee.encoder_bias",
+        "foot.encoder_bias",
     }
 
 
@@ -195,7 +210,7 @@ def test_awkward_names_survive_the_template() -> None:
         f'<body name="{n}"><joint name="{n}" damping="1"/><geom size="1"/></body>' for n in names
     )
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-    assert [p.elements for p in parse_space(template(model), model)] == [(n,) for n in names]
+    assert [p.elements for p in parse_space(template(model), model)] == 3 * [(n,) for n in names]
 
 
 _kinds = st.sampled_from(["dof_damping", "dof_frictionloss", "dof_armature", "servo_stiffness"])
@@ -269,3 +284,30 @@ def test_any_text_parses_or_is_refused(text: str, head: str) -> None:
         assert len(parse_space(head + text, MODEL).parameters)
     except DealHwError as error:
         assert isinstance(error, ConfigurationError | UnknownNameError)
+
+
+def test_a_value_of_which_nobody_said_anything_has_the_usual_prior() -> None:
+    """A chosen range, a given prior and a known value say more; the parameter's range stays the usual one."""
+    named = "kind: dof_damping, elements: FL_hip_joint"
+    usual, chosen, given, known = (
+        with_doubts(_entry(text)).parameters[0]
+        for text in (
+            named,
+            f"{named}, ratio: 3",
+            f"{named}, prior: {{mean: 0.5, std: 0.1}}",
+            f"{named}, known: 0.6",
+        )
+    )
+    assert (usual.prior_mean, usual.prior_std) == (0.6, DOUBTS["dof_damping"].std)
+    assert (chosen.prior_std, given.prior_std, known.prior_std) == (None, 0.1, None)
+    space = with_doubts(_entry(named))
+    assert with_usual_range(space) == space.names and with_doubts(space).parameters == space.parameters
+    assert with_usual_range(ParameterSpace([given])) == ()
+
+
+@pytest.mark.parametrize("kind", DOUBTS)
+def test_a_doubt_is_narrower_than_the_range_that_is_searched(kind: str) -> None:
+    """A prior as wide as the range would leave the value to the range, and call it unknown."""
+    low, high = KIND_TABLE[kind].usual_range(1.0, KIND_TABLE[kind].scale)
+    width = math.log(high / low) if KIND_TABLE[kind].scale == "log" else high - low
+    assert DOUBTS[kind].std < width / math.sqrt(12)

@@ -82,7 +82,7 @@ def test_ten_inertial_parameters_come_back(arm: Path, tmp_path: Path) -> None:
     # What the motion does not show keeps its prior, and the result says so.
     hidden = next(line for line in said if line.startswith("no trace in these recordings"))
     assert hidden.endswith("their prior expects: shoulder.ipos_z, shoulder.stretch_3")
-    words = " ".join(result.null_directions)
+    words = " ".join(result.prior_directions)
     assert "shoulder.stretch" in words and "the prior says more than the recordings" in words
     assert "lower.mass" not in words
     verdicts = dict(zip(result.space.names, result.verdicts, strict=True))

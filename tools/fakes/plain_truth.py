@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import tempfile
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.parameters import ParameterSpace
 from deal_hw.testing.plain_faults import Fault
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
@@ -20,10 +22,15 @@ Truth = tuple[PlainRobot, Problem, Refined]
 
 
 def problem_of(robot: PlainRobot, folder: Path, seconds: float = 3.0) -> Problem:
-    """Return the problem of two recordings of a robot, of 3 s or another length [s]."""
+    """Return the problem of two recordings of a robot, of 3 s or another length [s].
+
+    Its owner has measured masses and zeros: what else a model lacks is the subject of these tests.
+    """
     model, paths, held_out = write(robot, folder, seconds=seconds)
     work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
-    return Problem(work.robot, work.space, work.episodes, threads=1)
+    doubted = [p for p in work.space.parameters if p.kind not in ("body_mass", "encoder_bias")]
+    space = ParameterSpace(dataclasses.replace(p, prior_mean=None, prior_std=None) for p in doubted)
+    return Problem(work.robot, space, work.episodes, threads=1)
 
 
 @functools.cache

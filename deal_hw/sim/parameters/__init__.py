@@ -17,6 +17,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters.actuator import ACTUATOR_KINDS
 from deal_hw.sim.parameters.body import BODY_KINDS
+from deal_hw.sim.parameters.doubts import DOUBTS, Doubt
 from deal_hw.sim.parameters.effort import EFFORT_KINDS, EFFORT_NOISE
 from deal_hw.sim.parameters.fields import Array, Fields, element_id, unknown_name
 from deal_hw.sim.parameters.geom import GEOM_KINDS, check_partners
@@ -62,6 +63,31 @@ SERVO_KINDS = ("servo_stiffness", "servo_damping", "servo_effort_limit", "servo_
 """Kinds that scale with the sent command."""
 
 
+FORCE_KINDS = frozenset(
+    {
+        "body_mass",
+        "dof_armature",
+        "dof_damping",
+        "dof_dampingpoly_square",
+        "dof_dampingpoly_cube",
+        "dof_frictionloss",
+        "dof_friction_stribeck",
+        "joint_stiffness",
+        "tendon_frictionloss",
+        "tendon_damping",
+        "servo_stiffness",
+        "servo_damping",
+        "servo_effort_limit",
+        "servo_punch",
+        "motor_gain",
+        "motor_gear",
+        "transmission_stiffness",
+        "transmission_damping",
+    }
+)
+"""Kinds that scale together without a trace in any motion: masses, and all that is a force."""
+
+
 def find_kind(name: str) -> Kind:
     """Return the kind with a name.
 
@@ -76,13 +102,37 @@ def find_kind(name: str) -> Kind:
 def with_usual_range(space: ParameterSpace) -> tuple[str, ...]:
     """Return the searched parameters whose range is the usual one of their kind: nobody chose it.
 
-    A parameter with an expected value is none of them.
+    One whose expected value somebody gave is none of them.
     """
-    return tuple(
-        p.name
-        for p in space
-        if p.prior_std is None and (p.low, p.high) == find_kind(p.kind).usual_range(p.nominal, p.scale)
+    return tuple(p.name for p in space if _has_usual_range(p) and (p.prior_std is None or _is_doubted(p)))
+
+
+def with_doubts(space: ParameterSpace) -> ParameterSpace:
+    """Return the space in which searched values of which nobody said anything have the usual prior.
+
+    It is as wide as models usually err (:data:`~deal_hw.sim.parameters.doubts.DOUBTS`), around the nominal
+    value. A range that somebody chose says what they expect, and a prior that they gave says more.
+    """
+    return ParameterSpace(
+        dataclasses.replace(p, prior_mean=p.nominal, prior_std=DOUBTS[p.kind].std)
+        if _doubt_of(p) is not None and not p.known and p.prior_std is None and _has_usual_range(p)
+        else p
+        for p in space.parameters
     )
+
+
+def _has_usual_range(p: Parameter) -> bool:
+    return (p.low, p.high) == find_kind(p.kind).usual_range(p.nominal, p.scale)
+
+
+def _is_doubted(p: Parameter) -> bool:
+    doubt = _doubt_of(p)
+    return doubt is not None and (p.prior_mean, p.prior_std) == (p.nominal, doubt.std)
+
+
+def _doubt_of(p: Parameter) -> Doubt | None:
+    """Return the usual doubt of a parameter; None where there is none on its scale."""
+    return DOUBTS.get(p.kind) if p.scale == find_kind(p.kind).scale else None
 
 
 def wider(space: ParameterSpace, sides: Mapping[str, int]) -> ParameterSpace:

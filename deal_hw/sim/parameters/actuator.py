@@ -15,7 +15,7 @@ import numpy as np
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.parameters.drive import drive_of, filtered, setpoint_ratio, speed_servo
 from deal_hw.sim.parameters.fields import Array, Fields, element_id
-from deal_hw.sim.parameters.kind import Kind
+from deal_hw.sim.parameters.kind import DAMPING_RATIO, Kind
 
 _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 _SERVO_ADVICE = "for a motor use motor_gain or motor_gear"
@@ -140,6 +140,7 @@ ACTUATOR_KINDS = (
         apply=servo_damping,
         baseline=lambda m, i: drive_of(m, i, m.actuator(i).name).damping,
         usable=_damped,
+        ratio=DAMPING_RATIO,
     ),
     Kind(
         name="servo_effort_limit",

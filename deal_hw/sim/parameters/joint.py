@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.sim.parameters.fields import Array, Fields, element_id
-from deal_hw.sim.parameters.kind import FRICTION_RATIO, Kind, one_dof_joint
+from deal_hw.sim.parameters.kind import DAMPING_RATIO, FRICTION_RATIO, Kind, one_dof_joint
 
 
 def _set(fields: Fields, field: str, index: int, values: Array) -> None:
@@ -118,6 +118,7 @@ JOINT_KINDS = (
         apply=dof_damping,
         baseline=lambda m, i: _dof_value(m, "dof_damping", i),
         usable=one_dof_joint,
+        ratio=DAMPING_RATIO,
     ),
     Kind(
         name="dof_dampingpoly_square",

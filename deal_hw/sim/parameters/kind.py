@@ -19,6 +19,8 @@ RATIO = 5.0
 """Usual accuracy of a published model: a factor on either side."""
 FRICTION_RATIO = 20.0
 """The same for dry friction, which few models have measured: a real SO-101 has 8 to 9 times the model's."""
+DAMPING_RATIO = 10.0
+"""The same for damping, which few have measured either, and to which a motor's back-EMF adds."""
 
 Apply = Callable[[Fields, Sequence[str], Array], None]
 Together = Callable[[Fields, str, Mapping[str, Array]], None]

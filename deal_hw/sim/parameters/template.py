@@ -35,15 +35,17 @@ _ON = (
     "servo_stiffness",
     "servo_damping",
     "motor_gain",
+    "body_mass",
+    "encoder_bias",
 )
-_OFF = ("dof_friction_creep", "servo_effort_limit", "encoder_bias", "body_mass")
+_OFF = ("dof_friction_creep", "servo_effort_limit")
 
 
 def template(model: Any, title: str = "this model") -> str:
-    """Return a params.yaml with friction, damping and armature of every joint and gains of every actuator.
+    """Return a params.yaml with what an owner doubts: friction, damping, armature, gains, masses and zeros.
 
-    Masses, effort limits and encoder biases follow as comments. Without a measured mass or a known torque, no
-    motion shows the common scale of masses, frictions and gains.
+    Effort limits follow as comments. Without a measured mass or a known torque, no motion shows the common
+    scale of masses, frictions and gains: the expected value of each mass holds it.
 
     Args:
         model: The MjModel.
@@ -100,12 +102,27 @@ def _section(model: Any, kind: Kind, *, active: bool) -> list[str]:
     return lines
 
 
-def _doubled(model: Any, kind: Kind, actuator: str) -> bool:
-    """Return whether a servo's damping adds to a searched joint damping: one of them is enough."""
-    if kind.name != "servo_damping":
+def _doubled(model: Any, kind: Kind, element: str) -> bool:
+    """Return whether another damping of the joint is larger: they add up, and one of them is enough."""
+    if kind.name not in ("servo_damping", "dof_damping"):
         return False
-    joint = joint_of(model, element_id(model, "actuator", actuator))
-    return joint >= 0 and np.ravel(model.dof_damping[model.jnt_dofadr[joint]])[0] > 0
+    own, of_servo = _dampings(model, kind, element)
+    return own > of_servo if kind.name == "servo_damping" else own <= of_servo
+
+
+def _dampings(model: Any, kind: Kind, element: str) -> tuple[float, float]:
+    """Return the damping of a joint, or of that of an actuator, and the largest of its servos."""
+    number = element_id(model, kind.element, element)
+    joint = number if kind.element == "joint" else joint_of(model, number)
+    if joint < 0:
+        return 0.0, 0.0
+    servo = KIND_TABLE["servo_damping"]
+    served = [
+        value
+        for name, value, _ in _rows(model, servo)
+        if joint_of(model, element_id(model, servo.element, name)) == joint
+    ]
+    return float(np.ravel(model.dof_damping[model.jnt_dofadr[joint]])[0]), max(served, default=0.0)
 
 
 def _rows(model: Any, kind: Kind) -> Iterable[tuple[str, float, str]]:

@@ -49,9 +49,13 @@ class SimulatedTruth:
 
 
 def default_space(description: RobotDescription) -> ParameterSpace:
-    """Return the default parameters of a user's robot: friction, damping, armature and gains of the MJCF."""
+    """Return what differs in a simulated robot of a user: friction, damping, armature and gains of the MJCF.
+
+    Masses and zeros, which a calibration doubts, too, are those of the MJCF.
+    """
     model = compile_mjcf(description.mjcf)
-    return parse_space(template(model), model, "the default parameters (see --write-parameters)")
+    space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
+    return ParameterSpace(p for p in space.parameters if p.kind not in ("body_mass", "encoder_bias"))
 
 
 def draw_truth(space: ParameterSpace, seed: int, range_ratio: float, latency_s: float) -> SimulatedTruth:

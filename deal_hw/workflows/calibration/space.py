@@ -70,12 +70,14 @@ def without_speed_limits(
 
 
 def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> ParameterSpace:
-    """Return the parameters to search of a user's model; report what is not searched as it is 0 there.
+    """Return the parameters to search of a user's model, with the usual doubts as priors.
+
+    What is not searched at first, as it is 0 in the model, is reported.
 
     Raises:
         ConfigurationError: The parameter file, or a change of the parameters, cannot be used.
     """
-    from deal_hw.sim.parameters import check_space
+    from deal_hw.sim.parameters import check_space, with_doubts
     from deal_hw.sim.parameters.template import left_at_zero, template
     from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
@@ -89,7 +91,7 @@ def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> Paramet
         space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
     else:
         space = read_space(Path(settings.parameters), model)
-    space = settings.searched(space)
+    space = with_doubts(settings.searched(space))
     check_space(model, space)
     return space
 
