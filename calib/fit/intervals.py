@@ -33,6 +33,7 @@ from deal_hw.calib.fit.null_space import expected_directions, null_directions, n
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Normal
 from deal_hw.calib.fit.unexplained import Unexplained, as_one, autocorrelated
+from deal_hw.calib.fit.weak_directions import with_weak_directions
 from deal_hw.calibration import EXPLAINED_CHI2, Z90, Identifiability, listed
 from deal_hw.findings import Finding
 from deal_hw.parameters import LONGEST_LATENCY_S, ParameterSpace
@@ -470,6 +471,7 @@ def with_rows(refined: Refined) -> Refined:
     shooting = refined.shooting
     if shooting.problem.robot.base is None:
         normal = shooting.normal(refined.point, keep=True, stretch=NEAR_STRETCH, central=True)
+        normal = with_weak_directions(shooting, refined.point, normal)
     else:
         normal = shooting.normal(refined.point, keep=True)
     return dataclasses.replace(refined, normal=normal)

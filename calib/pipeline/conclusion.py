@@ -14,7 +14,9 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import LEAST_JITTER_S, WHITE_SAMPLES, Uncertainty, uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import Refined
+from deal_hw.calib.fit.refinement import Refined, refined_at
+from deal_hw.calib.fit.residual import value_bounds
+from deal_hw.calib.fit.weak_directions import scale_direction
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calibration import Budget, CalibrationResult
 
@@ -57,7 +59,7 @@ def conclude_fit(
     if whole is not None:
         fit = plain = whole.refined[whole.best]
     decided = whole is not None or problem.fixed_latency_s is not None
-    fit = with_rows(fit)
+    fit = settled(with_rows(fit))
     known = uncertainty_at(problem, fit, fixed_latency=decided)
     if whole is not None:
         known = averaged(problem, whole, known)
@@ -97,6 +99,33 @@ def conclude_fit(
             latency_range_s=problem.latency_range_s,
         )
     )
+
+
+def settled(fit: Refined) -> Refined:
+    """Return a fit, which has linearised residuals, with the common scale of masses and forces as expected.
+
+    Only what was expected holds that scale. The refinement's derivatives are off by kinks of dry friction,
+    which held it where the first steps had left it. Motion, and its derivatives by logarithms, are the same
+    at any scale; where something that is known holds it, there is no such step.
+    """
+    shooting, point, normal = fit.shooting, fit.point, fit.normal
+    scale = scale_direction(shooting)
+    curvature = float(scale @ normal.hessian @ scale)
+    expected = float(scale**2 @ normal.prior)
+    if shooting.contacts or not expected > 0.5 * curvature:
+        return fit
+    low, high = value_bounds(shooting.problem)
+    step = -float(scale @ normal.gradient) / curvature * scale
+    value = np.clip(point.value + step, np.minimum(low, point.value), np.maximum(high, point.value))
+    moved = dataclasses.replace(point, value=value)
+    cost = shooting.cost(moved)
+    if not cost < normal.cost:
+        return fit
+    there = dataclasses.replace(
+        normal, cost=cost, gradient=normal.gradient + normal.hessian @ (value - point.value)
+    )
+    known = refined_at(shooting, moved, there, fit.iterations)
+    return dataclasses.replace(known, shorter=fit.shorter, refused=fit.refused)
 
 
 @dataclass(frozen=True, slots=True)
