@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -105,6 +106,8 @@ def test_an_emergency_stop_asks_for_real_time_first(
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    # As its process ends, the command ignores Ctrl-C; the process of the tests goes on.
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
     monkeypatch.setattr(sys, "argv", ["deal-hw", verb])
     assert start.main() == (2 if asked else 0)
     assert "name the robot" in capsys.readouterr().err or not asked

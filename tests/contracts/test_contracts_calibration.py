@@ -117,7 +117,7 @@ def test_what_was_written_is_read(name: str, tmp_path: Path) -> None:
     found = document.read(path)
     written = json.loads(json.dumps(found.to_json()))  # type: ignore[attr-defined]
     # A file from before a key existed has its default.
-    known = {"unchecked": False, **document.values}
+    known = {"unchecked": False, "prior_directions": [], **document.values}
     assert {key: known[key] for key in written} == written
 
 
