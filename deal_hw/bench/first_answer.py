@@ -321,6 +321,10 @@ def _compared(config: FilesSettings, settings: FirstAnswerSettings) -> Row:
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 
     work = calibration_input(config)
+    if config.parameters is None:
+        # mujoco.sysid has neither zeros of encoders, nor what one expects of a mass to hold the common scale.
+        asked = [p for p in work.space.parameters if p.kind not in ("body_mass", "encoder_bias")]
+        work = replace(work, space=ParameterSpace(asked))
     # Imports are not counted.
     method = usual_method(config, work)
     make_method(method, refine=True)

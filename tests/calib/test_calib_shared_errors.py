@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fakes.plain_truth import problem_of
 from fakes.small_runs import small_run
 from hypothesis import given
 from hypothesis import strategies as st
 
+import deal_hw
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
@@ -40,9 +42,7 @@ from deal_hw.calibration import Budget, Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_faults import Fault, SharedFault
 from deal_hw.testing.plain_robots import make_robot, shared_words, write
-from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.run import calibrate_episodes
-from deal_hw.workflows.calibration.settings import FilesSettings
 
 SAMPLES, JOINTS, ACTUATED = 7, 4, (0, 1, 3)
 
@@ -112,11 +112,8 @@ def test_a_change_takes_each_channel_of_a_joint_along() -> None:
 
 
 def problem(kind: str, fault: Fault | SharedFault | None, folder: Path, seconds: float = 2.5) -> Problem:
-    """Return the problem of a simulated robot's recordings."""
-    robot = make_robot(kind, 3, fault)
-    model, paths, held_out = write(robot, folder, seconds=seconds)
-    work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
-    return Problem(work.robot, work.space, work.episodes, threads=1)
+    """Return the problem of a simulated robot's recordings, whose masses and zeros are not searched."""
+    return problem_of(make_robot(kind, 3, fault), folder, seconds)
 
 
 def test_candidates_are_few_and_each_mends_what_it_says(tmp_path: Path) -> None:
@@ -219,6 +216,16 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
     assert result.space.names == wrong.space.names
     assert verdict.colour == "red" and "Multiply all times by 0.5" in verdict.do
     assert result.provenance["shared_error"]["errors"][0]["kind"] == "clock"
+
+
+@pytest.mark.slow
+def test_a_mass_that_takes_the_place_of_a_clock_is_far_from_what_was_expected(tmp_path: Path) -> None:
+    """With its mass free, a pendulum whose clock ran twice as fast is explained by a quarter of that mass."""
+    model, data, held_out = write(make_robot("pendulum", 3, "fast-clock"), tmp_path)
+    found = deal_hw.calibrate(model, data, holdout=held_out, threads=1)
+    assert found.colour == "amber" and found.result.chi2 < 1.1
+    (far,) = (alarm for alarm in found.result.alarms if alarm.seen.startswith("Far from what was expected"))
+    assert "rod.mass" in far.seen and "standard deviations" in far.seen and "clock" in far.means
 
 
 @pytest.fixture
