@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any, get_args
@@ -63,12 +64,17 @@ def test_pattern_skips_what_cannot_have_the_parameter_and_a_name_does_not() -> N
 
 
 def test_weighed_known_and_prior() -> None:
-    """A weighed value is not searched; a prior's mean is a value, its std in the scale."""
+    """A weighed value is not searched; a prior's mean and std are values, or the std a share of the mean."""
     assert _entry("kind: body_mass, elements: base, weighed: 7.1").known == {"base.mass": 7.1}
     assert _entry("kind: body_mass, elements: base, known: true").known == {"base.mass": 6.921}
-    space = _entry("kind: body_mass, elements: base, prior: {mean: 7, std: 0.02}")
-    mean, std = space.prior
-    assert (mean[0], std[0]) == (7.0, 0.02)
+    # 0.14 kg of 7 kg are 2 %, the standard deviation of the logarithm.
+    for width in ("0.14", "2 %", "2%"):
+        space = _entry(f"kind: body_mass, elements: base, prior: {{mean: 7, std: {width}}}")
+        mean, std = space.prior
+        assert (mean[0], std[0]) == (7.0, pytest.approx(0.02, rel=1e-12))
+    zero = "kind: encoder_bias, elements: FL_hip_joint, prior: {mean: 0.05, std: "
+    assert _entry(zero + "0.01}").prior[1] == 0.01
+    assert _entry(zero + "10 %}").prior[1] == pytest.approx(0.005, rel=1e-12)
     assert ParameterSpace.from_json(space.to_json()).to_json() == space.to_json()
 
 
@@ -108,6 +114,8 @@ def test_linear_kinds_get_their_usual_width() -> None:
         ("kind: body_mass, elements: base, known: 7, weighed: 6", "not both"),
         ("kind: body_mass, elements: base, prior: {mean: 7}", "`mean` and `std`"),
         ("kind: body_mass, elements: base, prior: {mean: 7, std: 0}", "above 0"),
+        ("kind: body_mass, elements: base, prior: {mean: 7, std: some %}", "must be a number"),
+        ("kind: body_mass, elements: base, prior: {mean: -7, std: 1}", "mean must be above 0, got -7"),
         ("kind: body_mass, elements: base, prior: {mean: 99, std: 1}", "mean 99 lies outside"),
         ("kind: geom_friction, elements: FL_foot", "overridden by geom 'floor'"),
         ("kind: geom_friction, elements: FL_hip", "touches nothing"),
@@ -261,17 +269,22 @@ def _as_entry(p: Parameter) -> dict[str, Any]:
     if p.known:
         entry["known"] = True
     if p.prior_mean is not None and p.prior_std is not None:
-        entry["prior"] = {"mean": float(p.prior_mean), "std": float(p.prior_std)}
+        unit = p.prior_mean if p.scale == "log" else 1.0
+        entry["prior"] = {"mean": float(p.prior_mean), "std": float(p.prior_std) * float(unit)}
     return entry
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_written_space_reads_back(data: st.DataObject) -> None:
-    """Any space of valid parameters survives the round trip bit by bit."""
+    """Any space of valid parameters survives the round trip: bit by bit, but for the width of a prior."""
     count = data.draw(st.integers(1, 6))
     space = ParameterSpace(data.draw(_parameters(number)) for number in range(count))
-    assert parse_space(write_space(space), MODEL).to_json() == space.to_json()
+    read = parse_space(write_space(space), MODEL)
+    assert read.prior[1] == pytest.approx(space.prior[1], rel=1e-12)
+    widths = [p.prior_std for p in space.parameters]
+    same = [dataclasses.replace(p, prior_std=w) for p, w in zip(read.parameters, widths, strict=True)]
+    assert ParameterSpace(same).to_json() == space.to_json()
 
 
 @settings(max_examples=150, deadline=None)
@@ -299,7 +312,7 @@ def test_a_value_of_which_nobody_said_anything_has_the_usual_prior() -> None:
         )
     )
     assert (usual.prior_mean, usual.prior_std) == (0.6, DOUBTS["dof_damping"].std)
-    assert (chosen.prior_std, given.prior_std, known.prior_std) == (None, 0.1, None)
+    assert (chosen.prior_std, given.prior_std, known.prior_std) == (None, 0.2, None)
     space = with_doubts(_entry(named))
     assert with_usual_range(space) == space.names and with_doubts(space).parameters == space.parameters
     assert with_usual_range(ParameterSpace([given])) == ()

@@ -159,7 +159,7 @@ def _part(kind: str, element: str, part: SetPart, std: float, weighed: Any, mode
     wide = (
         {"ratio": part.reach} if found.scale == "log" else {"range": [mean - part.reach, mean + part.reach]}
     )
-    prior = {"mean": mean, "std": std}
+    prior = {"mean": mean, "std": f"{100 * std} %" if found.scale == "log" else std}
     return _parameters({"kind": kind, "elements": [element], "prior": prior, **wide}, model)
 
 
@@ -212,7 +212,7 @@ def _parameter(entry: Mapping[str, Any], kind: Kind, elements: tuple[str, ...], 
     known, value = _known(entry, name)
     nominal = _nominal(entry, kind, elements, model, name) if value is None else value
     low, high = _range(entry, kind, scale, nominal, name, known=known)
-    mean, std = _prior(entry, name)
+    mean, std = _prior(entry, name, scale)
     units = {kind.unit_of(model, element_id(model, kind.element, e)) for e in elements}
     if len(units) > 1:
         raise ConfigurationError(f"parameter {name!r} groups hinges with slides: their units differ, {units}")
@@ -289,7 +289,8 @@ def _known(entry: Mapping[str, Any], name: str) -> tuple[bool, float | None]:
     return True, _number(value, f"known value of {name!r}")
 
 
-def _prior(entry: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
+def _prior(entry: Mapping[str, Any], name: str, scale: Scale) -> tuple[float | None, float | None]:
+    """Return the expected value, in the unit, and its standard deviation in the parameter's scale."""
     if "prior" not in entry:
         return None, None
     prior = entry["prior"]
@@ -297,7 +298,14 @@ def _prior(entry: Mapping[str, Any], name: str) -> tuple[float | None, float | N
         raise ConfigurationError(
             f"parameter {name!r}: `prior` must have `mean` and `std`, got {shown(prior)}"
         )
-    return _number(prior["mean"], f"prior of {name!r}"), _number(prior["std"], f"prior of {name!r}")
+    mean, given = _number(prior["mean"], f"prior of {name!r}"), prior["std"]
+    percent = isinstance(given, str) and given.endswith("%")
+    std = _number(given[:-1] if percent else given, f"prior of {name!r}")
+    if percent:
+        return mean, std / 100 * (1.0 if scale == "log" else abs(mean))
+    if scale == "log" and not mean > 0:
+        raise ConfigurationError(f"parameter {name!r}: the prior's mean must be above 0, got {mean:g}")
+    return mean, std / mean if scale == "log" else std
 
 
 def _number(value: Any, what: str) -> float:
