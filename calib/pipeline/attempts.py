@@ -111,6 +111,18 @@ def with_weights(run: CalibrationRun, local: Refined) -> FitOutcome | Calibratio
     )
 
 
+def with_limits(run: CalibrationRun, local: Refined) -> FitOutcome | CalibrationRun:
+    """Ask for effort limits and dampings that are not searched, where drives reach their limits.
+
+    Each robot has them, so no law is asked where they leave only noise.
+    """
+    from deal_hw.calib.validation.explain import try_limits
+
+    with run.check(EXPLANATIONS):
+        tried = try_limits(run.problem, run.may_try, run.ask)
+    return with_explanation(dataclasses.replace(run, tried=tried)) or run
+
+
 def with_laws(run: CalibrationRun, local: Refined) -> FitOutcome | CalibrationRun:
     """Ask for laws that the model lacks, quantities that are 0 in it, and other masses.
 
@@ -167,8 +179,12 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         known, added = hold_alike(best.problem, outcome.known, outcome.latency_s, shifts)
         outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
     return outcome.with_alarms(
-        alarm,
-        diagnosis=[one.diagnosis.to_json() for one in (best, *(one for one, *_ in others))],
+        *([] if best.explanation.certain else [alarm]),
+        diagnosis=[
+            one.diagnosis.to_json()
+            for one in (best, *(one for one, *_ in others))
+            if not one.explanation.certain
+        ],
         candidates=[row.to_json() for row in ranked(rows)],
     )
 
@@ -194,7 +210,7 @@ def with_random_delays(run: CalibrationRun, local: Refined) -> FitOutcome | Cali
     return conclude_fit(run, None, local, late=found)
 
 
-MODEL_HOLDS: Sequence[Attempt] = (as_it_is, another_minimum, with_finer_step, with_own_zeros)
+MODEL_HOLDS: Sequence[Attempt] = (as_it_is, another_minimum, with_finer_step, with_limits, with_own_zeros)
 """Attempts after which the model is right."""
 
 MODEL_LACKS: Sequence[Attempt] = (with_laws, with_random_delays)

@@ -23,6 +23,7 @@ from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
 from deal_hw.calib.validation.explanations import (
     EXPLANATIONS,
     LAG,
+    LIMITS,
     PLAY,
     SHAPES,
     ZERO_CAUSES,
@@ -207,6 +208,27 @@ def try_explanations(
     return tuple(found)
 
 
+def try_limits(problem: Problem, allows: Allows, say: Callable[[str], None]) -> tuple[Tried, ...]:
+    """Fit with what shows at effort limits and is not searched; limits themselves where dampings do not do.
+
+    Args:
+        problem: The problem.
+        allows: Which fits may be made.
+        say: Called with the name of what is fitted.
+    """
+    found: tuple[Tried, ...] = ()
+    for each in LIMITS if fits_wider_models(problem) else ():
+        more = each.parameters(problem)
+        if not more or not allows(each.name, wider_cost(problem, True, len(more))):
+            continue
+        say(each.name)
+        wide = fit_wider(problem, more)
+        found = (Tried(each, problem, np.inf, wide), *found)
+        if wide is not None and wide.prediction.chi2 < MISMATCH_CHI2:
+            break
+    return found
+
+
 def _gains(
     problem: Problem,
     refined: Refined,
@@ -363,6 +385,8 @@ def _named(wide: WiderFit, of: Explanation) -> list[int]:
     if of is PLAY:
         found = wide.found
         return [int(k) for k in np.argsort(-found) if found[k] >= LEAST_PLAY * found.max() > 0]
+    if of.certain:
+        return list(range(len(wide.more)))
     if of.cause == "mass":
         # The scale of masses, gains and friction may be free. What a single value gains is its evidence.
         return [k for k, p in enumerate(wide.more) if keeps_mass(p, wide.found[k])]

@@ -20,10 +20,12 @@ from deal_hw.calib.validation.wider_models import MOST_FORCE, motion, zero_param
 from deal_hw.calibration import listed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
-from deal_hw.sim.parameters import KIND_TABLE
+from deal_hw.sim.parameters import KIND_TABLE, with_doubts
 from deal_hw.sim.parameters.laws import FREE_SPEED, STRIBECK_SPEED
 from deal_hw.sim.parameters.sensor import ENCODER_SCALE
+from deal_hw.sim.parameters.template import default_space
 from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
+from deal_hw.sim.recordings.effort_limits import drives_at_limit
 
 MOST_PLAY = 0.5
 """Widest play, as a share of the commands' span [-]."""
@@ -71,6 +73,7 @@ class Explanation:
         do: What to do about it, with {} for the joints or bodies.
         taken: What to do where the result has it, with {} for the names of its parameters there.
         in_mjcf: Whether an MJCF can say it.
+        certain: Whether each robot has it, so that a result with it has no weakness, whatever its values are.
     """
 
     name: str
@@ -80,6 +83,7 @@ class Explanation:
     do: str
     taken: str
     in_mjcf: bool = False
+    certain: bool = False
 
     def taken_as(self, names: Sequence[str], rivals: Sequence[str] = ()) -> str:
         """Return what to do where the result has it as these parameters.
@@ -110,6 +114,29 @@ def _together(problem: Problem) -> list[Parameter]:
     """Return all quantities that are 0, where they are of several kinds."""
     found = zero_parameters(problem)
     return found if len({p.kind for p in found}) > 1 else []
+
+
+def _dampings(problem: Problem) -> list[Parameter]:
+    return [p for p in _at_limits(problem) if p.kind != "servo_effort_limit"]
+
+
+def _at_limits(problem: Problem) -> list[Parameter]:
+    """Return limits and both dampings of drives that reach their effort limit, but those that are searched.
+
+    A limit cuts a drive's damping, but not its joint's: one does not stand for the other there.
+    """
+    of, model = problem.robot, problem.robot.model
+    drives = set(drives_at_limit(of, problem.episodes))
+    joints = {j for name, j in zip(of.actuator_names, of.description.actuated, strict=True) if name in drives}
+    if not drives:
+        return []
+    taken = {(p.kind, element) for p in problem.space.parameters for element in p.elements}
+    wanted = {"servo_effort_limit": drives, "servo_damping": drives, "dof_damping": joints}
+    return [
+        p
+        for p in with_doubts(default_space(model, drives))
+        if set(p.elements) <= wanted.get(p.kind, set()) and (p.kind, p.elements[0]) not in taken
+    ]
 
 
 def _play(problem: Problem) -> list[Parameter]:
@@ -257,6 +284,27 @@ ZEROS: Sequence[Explanation] = (
 )
 """Quantities that an MJCF can say, and this one does not: a model made from a URDF often has none of them."""
 
+
+def _at_limit(name: str, parameters: Callable[[Problem], list[Parameter]]) -> Explanation:
+    return Explanation(
+        name,
+        "drive",
+        parameters,
+        "Drives reach their effort limit. There the limit acts, and it cuts the drive's damping but not that "
+        "of the joint, so each of them has a value of its own. They were not searched.",
+        "Free servo_effort_limit, servo_damping and dof_damping of {} (--parameters).",
+        _TAKE,
+        in_mjcf=True,
+        certain=True,
+    )
+
+
+LIMITS: Sequence[Explanation] = (
+    _at_limit("other dampings of drives at their effort limit", _dampings),
+    _at_limit("other dampings and effort limits of drives at these limits", _at_limits),
+)
+"""What shows only where drives reach their limits, that with the fewest parameters first."""
+
 ZERO_CAUSES: Mapping[str, Cause] = {
     "dof_armature": "inertia",
     "dof_frictionloss": "friction",
@@ -396,7 +444,7 @@ def off_value(p: Parameter) -> float:
     """Return the value at which a parameter has no effect, or the least in its range."""
     if p.kind == FREE_SPEED:
         return p.high
-    return p.nominal if p.kind in (*SHAPES, ENCODER_SCALE, "body_mass") else 0.0
+    return p.nominal if p.scale == "log" else 0.0
 
 
 def sized(parameters: Sequence[Parameter]) -> list[int]:

@@ -36,6 +36,9 @@ DOUBTS: Final[Mapping[str, Doubt]] = MappingProxyType(
         "dof_armature": Doubt(0.8, "fits of a Go2's and a G1's joints against one value for all: 0.74"),
         "servo_stiffness": Doubt(0.8, "five published models of one SO-101 arm: 0.9"),
         "servo_damping": Doubt(1.0, "as a joint's damping, to which it adds"),
+        "servo_effort_limit": Doubt(
+            0.25, "stall torque of a hobby servo on a lever against its data sheet; URDFs of a Go1"
+        ),
         "motor_gain": Doubt(
             0.8, "our judgement: data sheets give 0.1 for a torque constant, but not what a command of 1 is"
         ),

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 
 from deal_hw.documentation import page
 from deal_hw.errors import ConfigurationError
+from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.kind import Kind, joint_of
+from deal_hw.sim.parameters.yaml_space import parse_space
 
 _HEAD = """\
 # Parameters of {title} for `deal-hw calibrate --parameters`. Remove what you know or do not want to search.
 # Every key is explained in {page}. Nominal values are the model's.
 # A value of 0 has no ratio, so its line is commented out: give it a `nominal` or a `range`, remove the #.
-# Measure what you can: `weighed: 0.35` fixes a mass, `prior: {{mean: 0.35, std: 0.02}}` says what you expect.
+# Measure what you can: `weighed: 0.35` fixes a mass, `prior: {{mean: 0.35, std: 0.02}}` says +-0.02 kg.
 # `{{kind: inertial, elements: BODY}}` searches a body's ten inertial parameters around the model's values.
 parameters:
 """
@@ -38,24 +40,29 @@ _ON = (
     "body_mass",
     "encoder_bias",
 )
-_OFF = ("dof_friction_creep", "servo_effort_limit")
+_OFF = ("dof_friction_creep",)
+_LIMIT = "servo_effort_limit"
 
 
-def template(model: Any, title: str = "this model") -> str:
+def template(model: Any, title: str = "this model", at_limit: Collection[str] = ()) -> str:
     """Return a params.yaml with what an owner doubts: friction, damping, armature, gains, masses and zeros.
 
-    Effort limits follow as comments. Without a measured mass or a known torque, no motion shows the common
-    scale of masses, frictions and gains: the expected value of each mass holds it.
+    A drive's effort limit follows as a comment, and so does the smaller one of a joint's two dampings, unless
+    the drive reaches its limit: there the limit acts, and cuts the drive's damping, but not the joint's.
+    Without a measured mass or a known torque, no motion shows the common scale of masses, frictions and
+    gains: the expected value of each mass holds it.
 
     Args:
         model: The MjModel.
         title: Name of the model in the head of the file.
+        at_limit: Actuators that reach their effort limit.
     """
     lines = [_HEAD.format(title=title, page=page("reference/parameters.md"))]
     for name in _ON:
-        lines += _section(model, KIND_TABLE[name], active=True)
+        lines += _section(model, KIND_TABLE[name], _searchable(model, KIND_TABLE[name], at_limit))
     for name in _OFF:
-        lines += _section(model, KIND_TABLE[name], active=False)
+        lines += _section(model, KIND_TABLE[name], ())
+    lines += _section(model, KIND_TABLE[_LIMIT], at_limit)
     if not any(line.startswith("  - ") for line in lines):
         raise ConfigurationError(
             f"{title} has no named joint or actuator with a friction, damping, armature or gain above 0; "
@@ -89,22 +96,40 @@ def left_at_zero(model: Any) -> dict[str, list[str]]:
     return {kind: joints for kind, joints in found.items() if joints}
 
 
-def _section(model: Any, kind: Kind, *, active: bool) -> list[str]:
+def default_space(model: Any, at_limit: Collection[str] = ()) -> ParameterSpace:
+    """Return the default parameters of a model: those of its :func:`template`."""
+    text = template(model, at_limit=at_limit)
+    return parse_space(text, model, "the default parameters (see --write-parameters)")
+
+
+def _section(model: Any, kind: Kind, active: Collection[str]) -> list[str]:
     rows = list(_rows(model, kind))
     if not rows:
         return []
     lines = [f"  # {kind.name} [{rows[0][2]}]; moves along: {kind.along}\n"]
     for element, value, unit in rows:
-        searchable = active and (kind.scale == "linear" or value > 0) and not _doubled(model, kind, element)
         text = f"- {{kind: {kind.name}, elements: {_quoted(element)}}}"
         # The sum with 0 makes -0.0 a 0.
-        lines.append(f"  {'' if searchable else '# '}{text}  # {value + 0.0:.6g} {unit}\n")
+        lines.append(f"  {'' if element in active else '# '}{text}  # {value + 0.0:.6g} {unit}\n")
     return lines
 
 
-def _doubled(model: Any, kind: Kind, element: str) -> bool:
+def _searchable(model: Any, kind: Kind, at_limit: Collection[str]) -> list[str]:
+    """Return the elements of which an owner doubts a quantity that the model has."""
+    return [
+        element
+        for element, value, _ in _rows(model, kind)
+        if (kind.scale == "linear" or value > 0) and not _doubled(model, kind, element, at_limit)
+    ]
+
+
+def _doubled(model: Any, kind: Kind, element: str, at_limit: Collection[str]) -> bool:
     """Return whether another damping of the joint is larger: they add up, and one of them is enough."""
     if kind.name not in ("servo_damping", "dof_damping"):
+        return False
+    joint = element_id(model, kind.element, element)
+    joint = joint if kind.element == "joint" else joint_of(model, joint)
+    if any(joint_of(model, element_id(model, "actuator", name)) == joint for name in at_limit):
         return False
     own, of_servo = _dampings(model, kind, element)
     return own > of_servo if kind.name == "servo_damping" else own <= of_servo

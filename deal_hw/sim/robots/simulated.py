@@ -19,8 +19,7 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import reported
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.parameters.template import template
-from deal_hw.sim.parameters.yaml_space import parse_space
+from deal_hw.sim.parameters import template
 from deal_hw.transport import Message
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
@@ -54,7 +53,7 @@ def default_space(description: RobotDescription) -> ParameterSpace:
     Masses and zeros, which a calibration doubts, too, are those of the MJCF.
     """
     model = compile_mjcf(description.mjcf)
-    space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
+    space = template.default_space(model)
     return ParameterSpace(p for p in space.parameters if p.kind not in ("body_mass", "encoder_bias"))
 
 

@@ -34,6 +34,7 @@ from deal_hw.workflows.calibration.settings import (
 )
 from deal_hw.workflows.calibration.setups import given_setups, in_setups
 from deal_hw.workflows.calibration.source import Division, Source
+from deal_hw.workflows.calibration.space import without_idle_limits
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
@@ -159,6 +160,8 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
             f"predicted better by that ({page('results/paper.md')}): leave --method out, unless the motion "
             "diverges from any prediction"
         )
+    if isinstance(settings, UserRobotSettings):
+        space = without_idle_limits(space, settings, robot, fit)
     shown = trajectories[0]
     walks = division is None and all_walk(robot, trajectories)
     if walks:

@@ -305,8 +305,8 @@ class Divided(Checked):
     """What to search of a user's robot, and which parts of its recordings to use."""
 
     parameters: File | None = None
-    """What to search (YAML; --write-parameters writes an example). By default friction, damping and armature
-    of every joint and gain of every actuator of the model."""
+    """What to search (YAML; --write-parameters writes an example). By default friction, damping, armature and
+    zero of every joint, gains of every actuator, and every mass."""
 
     holdout_part: Annotated[float | None, Range(0, 0.95)] = None
     """Share of each recording, its last part, that is held out to test the result, without --holdout; 0.25 by

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from deal_hw.workflows.say import Say
 
 if TYPE_CHECKING:
     from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.recordings.episode import SampledEpisode
 
 
 def named_space(robot: str, name: str = "") -> ParameterSpace:
@@ -78,8 +79,9 @@ def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> Paramet
         ConfigurationError: The parameter file, or a change of the parameters, cannot be used.
     """
     from deal_hw.sim.parameters import check_space, with_doubts
-    from deal_hw.sim.parameters.template import left_at_zero, template
-    from deal_hw.sim.parameters.yaml_space import parse_space, read_space
+    from deal_hw.sim.parameters.fields import element_names
+    from deal_hw.sim.parameters.template import default_space, left_at_zero
+    from deal_hw.sim.parameters.yaml_space import read_space
 
     if settings.parameters is None:
         zero = [f"{kind} of {short(', '.join(names))}" for kind, names in left_at_zero(model).items()]
@@ -88,12 +90,34 @@ def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> Paramet
                 f"0 in the model: {'; '.join(zero)}. They are not searched at first, but tried where the "
                 "model explains too little. If the robot has them, write values above 0 into the MJCF"
             )
-        space = parse_space(template(model), model, "the default parameters (see --write-parameters)")
+        # Which drives reach their limits is seen in the recordings; see `without_idle_limits`.
+        space = default_space(model, element_names(model, "actuator"))
     else:
         space = read_space(Path(settings.parameters), model)
     space = with_doubts(settings.searched(space))
     check_space(model, space)
     return space
+
+
+def without_idle_limits(
+    space: ParameterSpace,
+    settings: UserRobotSettings,
+    robot: RobotModel,
+    episodes: Sequence[SampledEpisode],
+) -> ParameterSpace:
+    """Return the space without effort limits that no recording reaches, and what shows only there.
+
+    A file's parameters, and those that the settings name, stay.
+    """
+    if settings.parameters is not None:
+        return space
+    from deal_hw.sim.parameters.template import default_space
+    from deal_hw.sim.recordings.effort_limits import drives_at_limit
+
+    names = {p.name for p in default_space(robot.model, drives_at_limit(robot, episodes)).parameters}
+    names |= {str(name) for name, *_ in (*dict(settings.known).items(), *settings.range)}
+    names |= set(settings.free)
+    return ParameterSpace(p for p in space.parameters if p.name in names)
 
 
 def write_parameters(settings: OwnDatasetSettings | FilesSettings, path: Path) -> Path:
