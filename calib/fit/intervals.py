@@ -50,6 +50,9 @@ LATENCY_AT_END = 0.01
 MISMATCH_CHI2 = EXPLAINED_CHI2
 """Mean squared residual over the noise variance above which the model is wrong [-]."""
 
+CONTRADICTS = 3.0
+"""Standard deviations from what was expected above which a value is doubtful [-]."""
+
 CORRELATION_SAMPLES = 2.0
 """Autocorrelation time above which it is wrong [samples]."""
 
@@ -289,7 +292,10 @@ def uncertainty(
         latency_interval_s=latency,
         null_directions=null_directions(space, unseen),
         prior_directions=expected_directions(space, data[:K, :K] / inflation, covariance[:K, :K]),
-        alarms=_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
+        alarms=(
+            *_alarms(space, theta, chi2, tau, least_tau, timing_std_s, bound != 0),
+            *contradictions(space, theta, std[:K]),
+        ),
         inflation=inflation,
         blind=blind,
         bound=bound,
@@ -448,6 +454,35 @@ def _alarms(
                 )
             )
     return as_one(alarms)
+
+
+def contradictions(space: ParameterSpace, theta: FloatArray, std: FloatArray) -> tuple[Finding, ...]:
+    """Return the alarm of values that are far from what was expected; none where there is none.
+
+    Args:
+        space: The parameters; those without a prior are not asked.
+        theta: The estimate, (K,).
+        std: Its standard deviations in the parameters' own scales, (K,).
+    """
+    mean, expected = space.prior
+    far = (space.to_scale(theta) - space.to_scale(mean)) / np.hypot(expected, std)
+    names = [
+        f"{space.names[k]} = {theta[k]:.3g} {space.free[k].unit}, expected {mean[k]:.3g}: "
+        f"{abs(far[k]):.1f} standard deviations"
+        for k in np.argsort(-np.abs(far))
+        if abs(far[k]) > CONTRADICTS
+    ]
+    if not names:
+        return ()
+    return (
+        Finding.alarm(
+            f"Far from what was expected: {'; '.join(names)}.",
+            "Either the model is much further off than models usually are, or these values stand for another "
+            "cause: a wrong clock, unit or axis of the recordings, or a law that the model lacks.",
+            "Check one of these values, and the recordings' clock and units. If it is right, say so with "
+            "--known NAME VALUE.",
+        ),
+    )
 
 
 def ended_at_bound(space: ParameterSpace, theta: FloatArray) -> npt.NDArray[np.bool_]:

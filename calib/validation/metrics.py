@@ -11,6 +11,7 @@ import numpy as np
 
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros, zeros_of
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
@@ -153,6 +154,18 @@ class HeldOut:
             noise=self._noise,
             zeros={name: zeros_of(more, zeros) for name, (_, _, zeros) in found.items() if len(zeros)},
         )
+
+    def chi2(self, theta: FloatArray, latency_s: float) -> float:
+        """Return the mean squared error over the noise variance, with start states fitted to each window.
+
+        Predictions from measured states have the error of these states, which may be larger than the noise.
+
+        Args:
+            theta: Values of the parameters, (K,).
+            latency_s: The latency [s].
+        """
+        whole = fitted_zeros(self.problem, theta, latency_s)
+        return at_parameters(self.problem, whole, latency_s, samples_in(self.problem, self._window_s)).chi2
 
     def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:
         """Store root mean squares, (n,), of all samples, and of the reported ones."""

@@ -6,6 +6,7 @@ A calibration that is stopped writes its best fit so far, and keeps the state fr
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 
 from deal_hw import findings
 from deal_hw.calibration import (
+    EXPLAINED_CHI2,
     LATENCY,
     LATENCY_RANGE_S,
     Budget,
@@ -31,7 +33,7 @@ from deal_hw.errors import (
     MissingExtraError,
     ModelNotWrittenError,
 )
-from deal_hw.findings import SafeChecks
+from deal_hw.findings import Finding, SafeChecks
 from deal_hw.parameters import ParameterSpace
 from deal_hw.scale.tasks import task_map
 from deal_hw.task_map import InThisProcess, TaskMap
@@ -304,7 +306,34 @@ def _with_errors(result: CalibrationResult, held_out: HeldOut) -> CalibrationRes
     # Laws and zeros of single recordings became parameters.
     found = _errors(held_out.of(result.space), result.estimate, result.latency_s)
     provenance = {**result.provenance, "heldout_rmse": found.to_json()}
-    return dataclasses.replace(result, heldout_nrmse=found.nrmse, provenance=provenance)
+    result = dataclasses.replace(result, heldout_nrmse=found.nrmse, provenance=provenance)
+    return _held_to_the_noise(result, held_out.of(result.space))
+
+
+def _held_to_the_noise(result: CalibrationResult, held_out: HeldOut) -> CalibrationResult:
+    """Return a result that explains its recordings, with an alarm if it does not explain held-out motion."""
+    problem = held_out.problem
+    if (
+        result.alarms
+        or not result.chi2 <= EXPLAINED_CHI2
+        or problem.robot.base is not None
+        or problem.noise_free
+    ):
+        return result
+    chi2 = held_out.chi2(result.estimate, result.latency_s)
+    alarms = []
+    if chi2 > EXPLAINED_CHI2 * max(result.chi2, 1.0):
+        alarms.append(
+            Finding.alarm(
+                f"On held-out motion the error is {math.sqrt(chi2):.1f} times the sensor's noise, on fitted "
+                f"motion {math.sqrt(result.chi2):.1f} times.",
+                "The held-out motion does what the fitted recordings do not show, such as a faster motion, "
+                "or an effort limit that is reached.",
+                "Fit it, too (--data), and hold other motion out. Or record the motion that is advised.",
+            )
+        )
+    provenance = {**result.provenance, "heldout_chi2": chi2}
+    return dataclasses.replace(result, alarms=tuple(alarms), provenance=provenance)
 
 
 def _require_windows(holdout: Sequence[SampledEpisode], window_s: float) -> None:
