@@ -163,7 +163,7 @@ def make_robot(kind: str, seed: int, fault: Fault | SharedFault | RightModel | N
         for name, factor in SPREAD.items():
             own[name] = getattr(joint, name) * float(np.exp(rng.uniform(-1, 1) * np.log(factor)))
             if name == "kp" and fault in WITH_MOTORS and joint.kp:
-                truth[f"{joint.name}.gain"] = own[name] / joint.kp
+                truth[f"{joint.name}.motor_gain"] = own[name] / joint.kp
             elif own[name]:
                 truth[f"{joint.name}.{'servo_stiffness' if name == 'kp' else name}"] = own[name]
         values[joint.name] = own

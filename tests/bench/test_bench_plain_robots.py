@@ -100,14 +100,14 @@ def test_a_servo_with_a_dead_zone_has_no_torque_within_it() -> None:
 @pytest.mark.parametrize(("command", "acts"), [(0.02, 0.0), (0.12, 0.1), (-0.12, -0.1)])
 def test_a_motor_with_a_dead_zone_loses_small_commands(command: float, acts: float) -> None:
     """5 % of the pendulum's 0.4 N·m is 0.02 N·m."""
-    gain = make_robot("pendulum", 0, "motor-dead-zone").truth["pivot.gain"]
+    gain = make_robot("pendulum", 0, "motor-dead-zone").truth["pivot.motor_gain"]
     assert torque(plant("pendulum", "motor-dead-zone"), 0.0, 0.0, command) == pytest.approx(gain * acts)
 
 
 @pytest.mark.parametrize("command", [0.1, -0.1])
 def test_a_motor_does_more_to_one_side(command: float) -> None:
     """1.12 times the command to one side, 0.88 times to the other."""
-    gain = make_robot("pendulum", 0, "motor-asymmetry").truth["pivot.gain"]
+    gain = make_robot("pendulum", 0, "motor-asymmetry").truth["pivot.motor_gain"]
     found = torque(plant("pendulum", "motor-asymmetry"), 0.0, 0.0, command)
     assert found == pytest.approx(gain * command * (1 + math.copysign(ASYMMETRY, command)))
 
@@ -162,7 +162,9 @@ def test_the_model_lacks_the_fault_and_nothing_else(fault: Fault) -> None:
     if fault in WITH_MOTORS:
         names = [model.actuator(i).name for i in range(model.nu)]
         np.testing.assert_allclose(model.actuator_gear[:, 0], 1.0)
-        np.testing.assert_allclose(truth.actuator_gear[:, 0], [robot.truth[f"{name}.gain"] for name in names])
+        np.testing.assert_allclose(
+            truth.actuator_gear[:, 0], [robot.truth[f"{name}.motor_gain"] for name in names]
+        )
     assert (model.na, truth.na) == (0, truth.nu if fault == "lag" else 0)
     fields = {"frictionloss": "dof_frictionloss", "damping": "dof_damping", "armature": "dof_armature"}
     for name, field in fields.items():

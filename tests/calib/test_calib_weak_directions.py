@@ -68,8 +68,8 @@ def test_a_common_scale_is_named_with_what_to_weigh() -> None:
     kinds = {
         "fore.mass": "body_mass",
         "hand.mass": "body_mass",
-        "a.gain": "motor_gain",
-        "b.gain": "motor_gain",
+        "a.motor_gain": "motor_gain",
+        "b.motor_gain": "motor_gain",
     }
     parameters = [
         Parameter(
@@ -90,7 +90,8 @@ def test_a_common_scale_is_named_with_what_to_weigh() -> None:
     data = 1e4 * (np.eye(4) - alike)
     covariance = np.linalg.inv(data + np.diag(1 / space.prior[1] ** 2))
     (words,) = expected_directions(space, data, covariance)
-    assert words.startswith("the common scale of fore.mass, hand.mass, a.gain, b.gain: no motion shows it")
+    names = "fore.mass, hand.mass, a.motor_gain, b.motor_gain"
+    assert words.startswith(f"the common scale of {names}: no motion shows it")
     assert "to +-39 %" in words and "weigh fore (--known fore.mass VALUE)" in words
     # Where a mass is weighed to 1 %, the recordings and that hold the scale.
     known = np.diag([1e4, 0.0, 0.0, 0.0])

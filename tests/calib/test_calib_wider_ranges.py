@@ -234,7 +234,7 @@ def test_a_state_of_a_search_knows_which_ranges_may_grow(files: dict[str, Path])
         "shoulder.frictionloss",
         "shoulder.damping",
         "shoulder.armature",
-        "shoulder.gain",
+        "shoulder.motor_gain",
         "shoulder.encoder_bias",
         "latency",
     )

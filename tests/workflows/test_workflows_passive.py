@@ -93,9 +93,9 @@ def test_a_free_swing_shows_friction_damping_and_inertia(
     assert values["hub.damping"] == pytest.approx(0.004, rel=0.05)
     assert values["hub.frictionloss"] == pytest.approx(0.003, rel=0.05)
     assert values["hub.armature"] == pytest.approx(0.001, rel=0.05)
-    assert "drive.gain" not in values and values["latency"] == 0.0
+    assert "drive.motor_gain" not in values and values["latency"] == 0.0
     assert any("no commands, and its motors (hub) were off" in text for text in printed)
-    assert any("not identifiable without commands" in text and "drive.gain" in text for text in printed)
+    assert any("not identifiable without commands" in text and "drive.motor_gain" in text for text in printed)
     assert found.colour == "green"
 
 
@@ -170,7 +170,7 @@ def test_a_free_swing_beside_a_driven_recording(
     # Torques up to 1.6 N·m, so that none is taken for a share of full power.
     data = [free, recording(4.0, 1)]
     inputs = calibration_input(FilesSettings(model=model, data=data, columns=named, threads=1))
-    assert "drive.gain" in [p.name for p in inputs.space]
+    assert "drive.motor_gain" in [p.name for p in inputs.space]
     still = [e for e in inputs.episodes if not np.any(e.target)]
     assert still and len(still) < len(inputs.episodes)
 

@@ -168,7 +168,7 @@ ACTUATOR_KINDS = (
     Kind(
         name="motor_gain",
         element="actuator",
-        quantity="gain",
+        quantity="motor_gain",
         unit="N·m",
         unit_slide="N",
         writes=("actuator_gainprm",),
