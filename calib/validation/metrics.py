@@ -155,17 +155,22 @@ class HeldOut:
             zeros={name: zeros_of(more, zeros) for name, (_, _, zeros) in found.items() if len(zeros)},
         )
 
-    def chi2(self, theta: FloatArray, latency_s: float) -> float:
-        """Return the mean squared error over the noise variance, with start states fitted to each window.
+    def chi2(self, theta: FloatArray, latency_s: float) -> tuple[float, float]:
+        """Return the mean squared error over the noise variance, and its standard deviation by chance.
 
-        Predictions from measured states have the error of these states, which may be larger than the noise.
+        Start states are fitted to each window: predictions from measured ones have the error of these, which
+        may be larger than the noise. The noise is estimated from these recordings, too, so a short one leaves
+        more to chance.
 
         Args:
             theta: Values of the parameters, (K,).
             latency_s: The latency [s].
         """
         whole = fitted_zeros(self.problem, theta, latency_s)
-        return at_parameters(self.problem, whole, latency_s, samples_in(self.problem, self._window_s)).chi2
+        length = samples_in(self.problem, self._window_s)
+        fit = at_parameters(self.problem, whole, latency_s, length)
+        # Of n errors the mean square varies by sqrt(2 / n), and so does the noise that is estimated from it.
+        return fit.chi2, 2.0 / np.sqrt(max(fit.normal.count, 1))
 
     def _simulate(self, fits: Mapping[tuple[bytes, float] | None, tuple[FloatArray, float] | None]) -> None:
         """Store root mean squares, (n,), of all samples, and of the reported ones."""

@@ -22,6 +22,7 @@ from deal_hw.calibration import (
     EXPLAINED_CHI2,
     LATENCY,
     LATENCY_RANGE_S,
+    Z90,
     Budget,
     CalibrationResult,
     ProgressCallback,
@@ -320,9 +321,9 @@ def _held_to_the_noise(result: CalibrationResult, held_out: HeldOut) -> Calibrat
         or problem.noise_free
     ):
         return result
-    chi2 = held_out.chi2(result.estimate, result.latency_s)
+    chi2, chance = held_out.chi2(result.estimate, result.latency_s)
     alarms = []
-    if chi2 > EXPLAINED_CHI2 * max(result.chi2, 1.0):
+    if chi2 > EXPLAINED_CHI2 * max(result.chi2, 1.0) * (1 + Z90 * chance):
         alarms.append(
             Finding.alarm(
                 f"On held-out motion the error is {math.sqrt(chi2):.1f} times the sensor's noise, on fitted "
