@@ -402,7 +402,7 @@ def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
 
     def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
         rest.pop("progress"), rest.pop("say")
-        searched = (space.names, space.nominal, space.low, space.high)
+        searched = (space.names, space.nominal, space.low, space.high, space.known)
         did.append(reported((robot.model, searched, episodes, holdout, rest)))
 
     def finish(work: Any, result: Any, results: Any, *settings: Any, **rest: Any) -> None:

@@ -62,7 +62,8 @@ def template(model: Any, title: str = "this model", at_limit: Collection[str] = 
         lines += _section(model, KIND_TABLE[name], _searchable(model, KIND_TABLE[name], at_limit))
     for name in _OFF:
         lines += _section(model, KIND_TABLE[name], ())
-    lines += _section(model, KIND_TABLE[_LIMIT], at_limit)
+    limited = [name for name, value, _ in _rows(model, KIND_TABLE[_LIMIT]) if name in at_limit and value > 0]
+    lines += _section(model, KIND_TABLE[_LIMIT], limited)
     if not any(line.startswith("  - ") for line in lines):
         raise ConfigurationError(
             f"{title} has no named joint or actuator with a friction, damping, armature or gain above 0; "
