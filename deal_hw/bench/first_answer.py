@@ -317,14 +317,14 @@ def _compared(config: FilesSettings, settings: FirstAnswerSettings) -> Row:
     from deal_hw.calib.pipeline.methods import make_method
     from deal_hw.calib.report.verdict import trust
     from deal_hw.calib.validation.metrics import HeldOut
+    from deal_hw.sim.parameters import without_masses_and_zeros
     from deal_hw.sim.recordings.parts import joined
     from deal_hw.sim.recordings.sysid_adapter import require_sysid
 
     work = calibration_input(config)
     if config.parameters is None:
         # mujoco.sysid has neither zeros of encoders, nor what one expects of a mass to hold the common scale.
-        asked = [p for p in work.space.parameters if p.kind not in ("body_mass", "encoder_bias")]
-        work = replace(work, space=ParameterSpace(asked))
+        work = replace(work, space=without_masses_and_zeros(work.space))
     # Imports are not counted.
     method = usual_method(config, work)
     make_method(method, refine=True)

@@ -13,6 +13,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.parameters import without_masses_and_zeros
 from deal_hw.testing.plain_faults import Fault
 from deal_hw.testing.plain_robots import PlainRobot, make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
@@ -28,7 +29,7 @@ def problem_of(robot: PlainRobot, folder: Path, seconds: float = 3.0) -> Problem
     """
     model, paths, held_out = write(robot, folder, seconds=seconds)
     work = calibration_input(FilesSettings(model=model, data=paths, holdout=held_out))
-    doubted = [p for p in work.space.parameters if p.kind not in ("body_mass", "encoder_bias")]
+    doubted = without_masses_and_zeros(work.space).parameters
     space = ParameterSpace(dataclasses.replace(p, prior_mean=None, prior_std=None) for p in doubted)
     return Problem(work.robot, space, work.episodes, threads=1)
 

@@ -121,6 +121,11 @@ def with_doubts(space: ParameterSpace) -> ParameterSpace:
     )
 
 
+def without_masses_and_zeros(space: ParameterSpace) -> ParameterSpace:
+    """Return the space without what its owner may have measured: masses of bodies and zeros of encoders."""
+    return ParameterSpace(p for p in space.parameters if p.kind not in ("body_mass", "encoder_bias"))
+
+
 def _has_usual_range(p: Parameter) -> bool:
     return (p.low, p.high) == find_kind(p.kind).usual_range(p.nominal, p.scale)
 

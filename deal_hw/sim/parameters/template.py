@@ -132,14 +132,12 @@ def _doubled(model: Any, kind: Kind, element: str, at_limit: Collection[str]) ->
     joint = joint if kind.element == "joint" else joint_of(model, joint)
     if any(joint_of(model, element_id(model, "actuator", name)) == joint for name in at_limit):
         return False
-    own, of_servo = _dampings(model, kind, element)
+    own, of_servo = _dampings(model, joint)
     return own > of_servo if kind.name == "servo_damping" else own <= of_servo
 
 
-def _dampings(model: Any, kind: Kind, element: str) -> tuple[float, float]:
-    """Return the damping of a joint, or of that of an actuator, and the largest of its servos."""
-    number = element_id(model, kind.element, element)
-    joint = number if kind.element == "joint" else joint_of(model, number)
+def _dampings(model: Any, joint: int) -> tuple[float, float]:
+    """Return the damping of a joint, and the largest of its servos; 0 for an actuator of no joint."""
     if joint < 0:
         return 0.0, 0.0
     servo = KIND_TABLE["servo_damping"]
