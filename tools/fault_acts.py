@@ -198,6 +198,8 @@ JOINT_FAULTS = ("limp", "held", "frozen reading", "exchanged readings", "turned 
 """How an emulator's log names the faults of joints."""
 JOINT_MS = 2000.0
 """Longest time until a run is passive whose joints do not follow (docs/explanation/safety.md) [ms]."""
+LEAVES_MS = 500.0
+"""The push that is judged begins when the set-point has left a reading that stands or is another's [ms]."""
 
 
 def joint_cases(
@@ -226,7 +228,11 @@ def joint_cases(
     }
     for what, option in list(readings.items())[: 3 if exchanged else 1]:
         words = (*after(option), "--faulty-joint", "{joint}")
-        yield Case(name=f"the reading of a joint {what}", emulator=words, **common)
+        yield Case(
+            name=f"the reading of a joint {what}",
+            emulator=words,
+            **{**common, "within_ms": JOINT_MS + LEAVES_MS},
+        )
 
 
 def process_cases(interrupt_ms: float = 600.0) -> tuple[Case, ...]:
