@@ -46,6 +46,7 @@ class RestartSettings:
     fewest_generations: int = 15
     explained: float = MISMATCH_CHI2
     drawn: int = 8
+    alike_ends: bool = False
 
     def draws(self, problem: Problem) -> int:
         """Return the number of refinements from drawn points."""
@@ -104,6 +105,8 @@ def refined_search(
     if part is not run.problem and settings.draws(run.problem):
         on_part = dataclasses.replace(run, problem=part)
         begun = refined_from(on_part, *start, _shortest(run))
+        if run.local is not None and _alike(run, begun, settings):
+            return run.local, True
         # The local fit of the same windows, which had no reason to go on to longer ones.
         if run.local is not None and run.local.normal.count == begun.normal.count:
             begun = run.local if clearly_lower(run.local, begun) else begun
@@ -115,8 +118,18 @@ def refined_search(
     refined = refined_from(run, *start)
     if refined.chi2 < settings.explained or not settings.draws(run.problem):
         return refined, False
+    if run.local is not None and _alike(run, refined, settings):
+        return min(run.local, refined, key=lambda fit: fit.chi2), True
     lower = lower_minimum(run, refined, settings, searched)
     return lower or refined, lower is None or not settings.much_lower(lower, refined)
+
+
+def _alike(run: CalibrationRun, found: Refined, settings: RestartSettings) -> bool:
+    """Return whether a fit and the local one leave the same residual, and that is enough."""
+    if not settings.alike_ends or run.local is None:
+        return False
+    low, high = sorted([found.chi2, run.local.chi2])
+    return high - low < settings.same * low
 
 
 def lower_minimum(

@@ -226,6 +226,9 @@ class Refinement(Fits):
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search and refine. See :meth:`Fits.best`."""
         settings, left, floating = self.restarts, run.budget.generations, run.problem.robot.base is not None
+        if self.predictions is not None and run.local is not None and far_from_noise(run, run.local):
+            # Fits of predictions follow, and no minimum is right: two starts that agree are enough.
+            settings = dataclasses.replace(settings, alike_ends=True)
         best: tuple[CalibrationResult, Refined] | None = None
         run.say_search()
         attempt = 0

@@ -118,6 +118,25 @@ def test_no_more_points_are_drawn_once_all_fits_end_alike(
     assert len(tried) - 1 - (300.0 in tried) == fits
 
 
+@pytest.mark.parametrize(("of_search", "drawn"), [(900.0, 0), (500.0, 1)])
+def test_nothing_is_drawn_where_the_local_fit_and_the_search_end_alike(
+    small_problem: Callable[..., Problem], monkeypatch: pytest.MonkeyPatch, of_search: float, drawn: int
+) -> None:
+    problem = small_problem()
+    local = dataclasses.replace(refine(problem, problem.space.nominal, 0.0, (0.2,), iterations=1), chi2=890.0)
+    search = FixedSearch(problem.space.nominal, 0.0, 0.05)
+    monkeypatch.setattr(minima, "from_start", lambda *_, **__: dataclasses.replace(local, chi2=of_search))
+    asked: list[Refined] = []
+    monkeypatch.setattr(minima, "lower_minimum", lambda _, fit, *__: asked.append(fit))
+    run = dataclasses.replace(run_of(problem, search, []), local=local)
+    searched = search.run(problem, run.budget, run.rng)
+    settings = RestartSettings(alike_ends=True)
+    refined, alike = refined_search(run, searched, settings)
+    assert len(asked) == drawn
+    assert alike
+    assert refined.chi2 == min(of_search, 890.0)
+
+
 def test_a_brief_search_sees_a_part_of_long_recordings(small_problem: Callable[..., Problem]) -> None:
     """Every other second of 17; a whole search, and one of 15 s, see all."""
     seen: list[int] = []
