@@ -175,8 +175,8 @@ class Shooting:
     """Residuals, normal equations and candidate steps for one cut into windows of ``length`` samples.
 
     Start states are ``given``, the smoothed ones, or each is an unknown; exact states are always given.
-    ``prior_share`` is the spread of parameters around their nominal values as a share of their range, in
-    their own scale; infinite to use their own priors only. A ``fixed_latency`` stays as it is in all steps;
+    ``prior_share`` is the spread of parameters without a prior around their nominal values as a share of
+    their range, in their own scale; infinite for none. A ``fixed_latency`` stays as it is in all steps;
     by default one that the problem gives.
     """
 
@@ -210,12 +210,12 @@ class Shooting:
         self._kept = kept or _Kept()
         space = problem.space
         mean, std = space.prior
-        own, around = 1 / std**2, 1 / (prior_share * space.width) ** 2
+        own = 1 / std**2
+        # A range says something only where nothing else does.
+        around = np.where(np.isfinite(std), 0.0, 1 / (prior_share * space.width) ** 2)
         # The latency has no prior.
         self.prior_information = np.append(own + around, 0.0)
-        # Product of two normal laws: informations add, and the mean is weighted with them.
-        centre = own * space.to_scale(mean) + around * space.to_scale(space.nominal)
-        self.prior_mean = np.append(centre / np.maximum(own + around, 1e-300), 0.0)
+        self.prior_mean = np.append(space.to_scale(mean), 0.0)
         C = problem.coordinates
         # Where a window diverges whatever its start, nothing else is left to say where it starts.
         self.start_information = [np.maximum(1 / d.prior_std**2, LEAST_INFORMATION) for d in self.data]

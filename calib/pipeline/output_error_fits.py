@@ -49,10 +49,12 @@ from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, at_parameters
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits, Refinement
+from deal_hw.calib.pipeline.wider_ranges import MOST
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Z90, Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
+from deal_hw.sim.parameters import wider
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.task_map import InThisProcess
@@ -193,8 +195,8 @@ class OutputErrorFits(Fits):
         from deal_hw.calib.validation.explanations import EXPLANATIONS
 
         settings, (first, *windows) = self.settings, self.first or self.started(run).first
-        # The recordings as they are fitted, which may be joined or a part.
-        problem = first.plain.problem
+        # The recordings as they are fitted, which may be joined or a part, in ranges that may have grown.
+        problem = windows[-1].plain.problem
         # The fits continue from the search's estimate, so it only has to find the neighbourhood.
         run = dataclasses.replace(run, budget=dataclasses.replace(run.budget, brief=True))
         searched = self.given or self._searched(run, problem, first, windows)
@@ -204,6 +206,7 @@ class OutputErrorFits(Fits):
         better = self.given is None and self._better_start(problem, first, searched)
         if better:
             windows = self._windows(run, problem, (searched.estimate, searched.latency_s))
+            problem = windows[-1].plain.problem
         decided = LawfulChoice(Choice("long", {}, settings.long_s, note="without folds"))
         screened, lengths = ScreenedLaws(), (windows[0].recipe.seconds, settings.long_s)
         if run.settings.cross_validation:
@@ -410,8 +413,9 @@ class OutputErrorFits(Fits):
         windows_s = self.settings.windows_s if run.settings.cross_validation else (self.settings.long_s,)
         recipe, found = self.settings.recipe("long"), list[OutputErrorFit]()
         for seconds in windows_s:
-            found.append(fit_output_error(problem, *start, dataclasses.replace(recipe, seconds=seconds)))
-            start = found[-1].member
+            fit = fit_beyond_ends(problem, start, dataclasses.replace(recipe, seconds=seconds))
+            found.append(fit)
+            problem, start = fit.plain.problem, fit.member
         return found
 
     def _members(
@@ -565,6 +569,25 @@ def _fold_masks(problem: Problem) -> Sequence[Sequence[Mask]]:
 def _say_fold(run: CalibrationRun, folds: int, fold: int, law: str = "") -> None:
     question = f"does {law} predict it better?" if law else "which fit predicts unseen data best?"
     run.say("cross-validation", f"{fold + 1} of {folds}: {question}")
+
+
+def fit_beyond_ends(problem: Problem, start: Member, recipe: Recipe) -> OutputErrorFit:
+    """Fit from a start; where it ends at an end of a range that nobody chose, again in a wider one.
+
+    Only parameters whose expected value holds them go on there. Nothing else would end such a fit, since its
+    residual scale says that the model is wrong.
+    """
+    fit = fit_output_error(problem, *start, recipe)
+    for _ in range(MOST):
+        held = {p.name for p in problem.space if p.prior_std is not None}
+        ends = dict(zip(problem.space.names, np.sign(problem.space.normalize(fit.theta) - 0.5), strict=True))
+        at_end = held.intersection(names_at_bound(problem.space, fit.theta), problem.guessed)
+        wide = wider(problem.space, {name: int(ends[name]) for name in sorted(at_end)})
+        if wide.to_json() == problem.space.to_json():
+            break
+        problem = problem.with_space(wide)
+        fit = fit_output_error(problem, *fit.member, recipe)
+    return fit
 
 
 def _joined_stretches(problem: Problem) -> Problem:

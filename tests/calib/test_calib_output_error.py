@@ -23,10 +23,12 @@ from deal_hw.calib.fit.output_error import (
     prediction_rmse,
     standing_rmse,
 )
+from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.output_error_fits import (
     OutputErrorFits,
     OutputErrorSettings,
+    fit_beyond_ends,
     output_error_method,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
@@ -34,6 +36,7 @@ from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
+from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
@@ -111,6 +114,34 @@ def test_a_long_fit_finds_parameters_and_latency_and_says_how_far_predictions_ar
     rmse = prediction_rmse(problem, [(fit.theta, fit.latency_s), (problem.space.nominal, 0.0)], 2.0)
     assert rmse[0, 0] == pytest.approx(fit.scale[0], rel=1e-6)
     assert rmse[1, 0] > 20 * rmse[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("expected", "guessed", "beyond"), [(True, True, True), (False, True, False), (True, False, False)]
+)
+def test_a_range_that_nobody_chose_does_not_end_a_fit_that_an_expected_value_holds(
+    problem: Problem, expected: bool, guessed: bool, beyond: bool
+) -> None:
+    """The true damping is twice the higher end of the range."""
+    given = problem.space.with_range("hinge.damping", 0.05, TRUTH[0] / 2)
+    prior = {"prior_mean": 0.2, "prior_std": 1.0} if expected else {"prior_mean": None, "prior_std": None}
+    damping = dataclasses.replace(given["hinge.damping"], **prior)
+    narrow = problem.with_space(ParameterSpace([damping, *given.parameters[1:]]))
+    narrow.guessed = ("hinge.damping",) if guessed else ()
+    fit = fit_beyond_ends(narrow, (narrow.space.nominal, 0.0), Recipe())
+    assert fit.theta[0] == pytest.approx(TRUTH[0] if beyond else TRUTH[0] / 2, rel=0.02)
+    assert bool(fit.plain.problem.space["hinge.damping"].high > TRUTH[0]) is beyond
+
+
+def test_the_expected_value_of_a_parameter_counts_once(problem: Problem) -> None:
+    """Where somebody expects a value, the range says nothing more."""
+    damping, friction = problem.space.parameters
+    expected = dataclasses.replace(damping, prior_mean=damping.nominal, prior_std=0.5)
+    ranged = dataclasses.replace(friction, prior_mean=None, prior_std=None)
+    held = problem.with_space(ParameterSpace([expected, ranged]))
+    shooting = Shooting(held, 10, prior_share=0.289)
+    of_range = 1 / (0.289 * held.space.width[1]) ** 2
+    assert shooting.prior_information.tolist() == pytest.approx([4.0, of_range, 0.0])
 
 
 def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem) -> None:
