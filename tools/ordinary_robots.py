@@ -312,12 +312,15 @@ def write_case(
     zero, latency_s = np.zeros(len(robot.joints)), float(rng.uniform(0, 0.03))
     zero[int(rng.integers(len(zero)))] = float(np.radians(rng.uniform(-1.5, 1.5)))
     (folder / "nominal.xml").write_text(robot.xml(values), encoding="utf-8")
-    torque = robot.feedback is not None
     channels = []
     for k, name in enumerate(robot.joints):
         channel: dict[str, Any] = {"name": name, "position": f"{name}_pos"}
         if k in robot.drives:
-            channel |= {"target": f"{name}_command"} | ({"target_unit": "Nm"} if torque else {})
+            channel["target"] = f"{name}_command"
+            if robot.feedback is not None:
+                # The command is the control of the MJCF, and its effort that of the owner's gain.
+                full = values[f"d{robot.drives.index(k)}.motor_gain"]
+                channel["target_normalised"] = {"from": [-1.0, 1.0], "to": [-full, full]}
         channels.append(channel)
     columns = {"time": {"column": "t", "unit": "s"}, "unit": "rad", "joints": channels}
     (folder / "columns.yaml").write_text(yaml.safe_dump(columns, sort_keys=False), encoding="utf-8")
