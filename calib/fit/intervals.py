@@ -166,7 +166,9 @@ class Uncertainty:
                 # What compensates for a known effect is a property of the fit, not of the robot.
                 found.append("weak" if self.space.names[k] in self.biased else "identifiable")
             else:
-                found.append("weak" if std <= WEAK_SHARE * prior_std[k] else "not identifiable")
+                # An expected value that recordings sharpen is a value; a range that they hardly cut is none.
+                held = np.isfinite(expected_std[k]) or std <= WEAK_SHARE * prior_std[k]
+                found.append("weak" if held else "not identifiable")
         return tuple(found)
 
     def with_alarms(self, *first: Finding, last: Sequence[Finding] = ()) -> Uncertainty:

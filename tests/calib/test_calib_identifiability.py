@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 from typing import cast
 
@@ -143,6 +144,18 @@ def test_a_prior_resolves_a_common_factor() -> None:
     assert weighed.verdicts == ("identifiable", "identifiable")
     # The prior is no data: a residual that is too large does not make the scale less sure.
     assert weighed.covariance[0, 0] == pytest.approx(1e-4, rel=0.01)
+
+
+@pytest.mark.parametrize(("expected_std", "verdict"), [(0.8, "weak"), (None, "not identifiable")])
+def test_an_expected_value_that_the_data_sharpen_is_a_value(expected_std: float | None, verdict: str) -> None:
+    """What is known to half of its logarithm: from 0.8 that were expected, or from a range of hardly more."""
+    space = ParameterSpace(
+        dataclasses.replace(p, low=0.25, high=4.0, prior_mean=expected_std and 1.0, prior_std=expected_std)
+        for p in _space("a")
+    )
+    prior = np.array([1 / 0.8**2 if expected_std else 0.0, 0.0])
+    known = _told(space, [1.0], np.array([[1 / 0.5**2]]), prior=prior)
+    assert known.verdicts == (verdict,)
 
 
 def test_what_a_null_direction_hardly_moves_keeps_its_value() -> None:
