@@ -21,9 +21,9 @@ from deal_hw.calibration import listed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters import KIND_TABLE, with_doubts
+from deal_hw.sim.parameters.default_space import default_space
 from deal_hw.sim.parameters.laws import FREE_SPEED, STRIBECK_SPEED
 from deal_hw.sim.parameters.sensor import ENCODER_SCALE
-from deal_hw.sim.parameters.template import default_space
 from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
 from deal_hw.sim.recordings.effort_limits import drives_at_limit
 

@@ -18,7 +18,7 @@ from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters import KIND_TABLE
-from deal_hw.sim.parameters.template import left_at_zero
+from deal_hw.sim.parameters.default_space import left_at_zero
 from deal_hw.types import FloatArray
 
 WINDOW_S = 0.2

@@ -16,9 +16,12 @@ from hypothesis import strategies as st
 from deal_hw.drivers.go2.descriptions.floor import DESCRIPTION, JOINTS
 from deal_hw.errors import ConfigurationError, DealHwError, UnknownNameError
 from deal_hw.parameters import Parameter, ParameterSpace, Scale
+from deal_hw.robots import recorded_description
+from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.parameters import KIND_TABLE, with_doubts, with_usual_range
+from deal_hw.sim.parameters.default_space import default_space, left_at_zero
 from deal_hw.sim.parameters.doubts import DOUBTS
-from deal_hw.sim.parameters.template import left_at_zero, template
+from deal_hw.sim.parameters.template import template
 from deal_hw.sim.parameters.yaml_space import parse_space, read_space
 
 MODEL = mujoco.MjModel.from_xml_path(str(DESCRIPTION.mjcf))
@@ -170,6 +173,43 @@ def test_template_parses_to_all_that_an_owner_doubts(tmp_path: Path) -> None:
         "body_mass",
         "encoder_bias",
     }
+
+
+_ARM = """<mujoco><worldbody><body name="link"><joint name="knee" {}/><geom size=".1"/>
+<body name="rail"><joint name="rail" type="slide" {}/><geom size=".1"/></body></body></worldbody>
+<actuator><position name="knee" joint="knee" kp="{!r}" kv="{!r}" forcerange="-{!r} {!r}"/>
+<motor name="push" joint="rail" gear="{!r}"/></actuator></mujoco>"""
+_value = st.just(0.0) | st.floats(1e-4, 1e3)
+
+
+@pytest.mark.parametrize("robot", ["allegro", "b2", "cartpole", "g1", "go2", "h1", "humanoid", "so101"])
+def test_the_written_file_reads_back_as_the_default_space(robot: str) -> None:
+    """People edit what the code searches: names, values, ranges, scales and order, of each shipped model."""
+    model = compile_mjcf(recorded_description(robot).mjcf)
+    assert parse_space(template(model), model).parameters == default_space(model).parameters
+
+
+@settings(deadline=None)
+@given(*3 * [st.tuples(_value, _value, _value)])
+def test_whatever_is_zero_the_file_reads_back_as_the_default_space(
+    knee: tuple[float, ...], rail: tuple[float, ...], drive: tuple[float, ...]
+) -> None:
+    """A hinge and a slide, with any of friction, damping, armature and a drive's damping and limit at 0."""
+    text = 'frictionloss="{!r}" damping="{!r}" armature="{!r}"'
+    kp, kv, most = drive
+    values = kp or 1.0, kv, most or 1.0, most or 1.0, kp or 2.0
+    arm = _ARM.format(text.format(*knee), text.format(*rail), *values)
+    model = mujoco.MjModel.from_xml_string(arm)
+    assert parse_space(template(model), model).parameters == default_space(model).parameters
+
+
+def test_a_drive_at_its_limit_has_its_limit_and_both_dampings_searched() -> None:
+    """There the limit cuts the drive's damping, not the joint's. An actuator without a name is let be."""
+    arm = _ARM.format('damping="1"', "", 9.0, 2.0, 5.0, 5.0, 1.0)
+    model = mujoco.MjModel.from_xml_string(arm.replace('<motor name="push"', "<motor"))
+    usual, limited = default_space(model), default_space(model, ("knee", ""))
+    assert set(limited.names) - set(usual.names) == {"knee.damping", "knee.servo_effort_limit"}
+    assert limited["knee.servo_effort_limit"].nominal == 5.0
 
 
 def test_every_line_of_the_template_can_be_switched_on() -> None:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import mujoco
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.parameters import Scale
+from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters.fields import Array, Fields
 
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -81,6 +81,32 @@ class Kind:
             width = self.spread or abs(nominal) or 1.0
             return max(nominal - width, self.least), min(nominal + width, self.most)
         return max(nominal / self.ratio, self.least), min(nominal * self.ratio, self.most)
+
+    def usual_parameter(self, model: Any, index: int, element: str) -> Parameter:
+        """Return the parameter of one element with the model's value, and the usual range around it.
+
+        Args:
+            model: The MjModel.
+            index: Number of the element.
+            element: Its name.
+
+        Raises:
+            ConfigurationError: An MJCF has no such value, or it gives no range.
+        """
+        if self.baseline is None:
+            raise ConfigurationError(f"an MJCF has no {self.name}, so {element!r} has no usual one")
+        nominal = self.baseline(model, index)
+        low, high = self.usual_range(nominal, self.scale)
+        return Parameter(
+            name=f"{element}.{self.quantity}",
+            kind=self.name,
+            elements=(element,),
+            unit=self.unit_of(model, index),
+            nominal=nominal,
+            low=low,
+            high=high,
+            scale=self.scale,
+        )
 
     def unit_of(self, model: Any, index: int) -> str:
         """Return the unit for one element of a model."""

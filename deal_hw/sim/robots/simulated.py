@@ -19,7 +19,8 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import reported
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel
-from deal_hw.sim.parameters import template, without_masses_and_zeros
+from deal_hw.sim.parameters import without_masses_and_zeros
+from deal_hw.sim.parameters.default_space import default_space as doubted
 from deal_hw.transport import Message
 from deal_hw.types import FloatArray, JointCommand, RobotState, Status
 
@@ -53,7 +54,7 @@ def default_space(description: RobotDescription) -> ParameterSpace:
     Masses and zeros, which a calibration doubts, too, are those of the MJCF.
     """
     model = compile_mjcf(description.mjcf)
-    return without_masses_and_zeros(template.default_space(model))
+    return without_masses_and_zeros(doubted(model))
 
 
 def draw_truth(space: ParameterSpace, seed: int, range_ratio: float, latency_s: float) -> SimulatedTruth:

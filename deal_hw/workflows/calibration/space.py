@@ -79,8 +79,8 @@ def searched_space(settings: UserRobotSettings, model: Any, say: Say) -> Paramet
         ConfigurationError: The parameter file, or a change of the parameters, cannot be used.
     """
     from deal_hw.sim.parameters import check_space, with_doubts
+    from deal_hw.sim.parameters.default_space import default_space, left_at_zero
     from deal_hw.sim.parameters.fields import element_names
-    from deal_hw.sim.parameters.template import default_space, left_at_zero
     from deal_hw.sim.parameters.yaml_space import read_space
 
     if settings.parameters is None:
@@ -111,7 +111,7 @@ def without_idle_limits(
     """
     if settings.parameters is not None:
         return space
-    from deal_hw.sim.parameters.template import default_space
+    from deal_hw.sim.parameters.default_space import default_space
     from deal_hw.sim.recordings.effort_limits import drives_at_limit
 
     names = {p.name for p in default_space(robot.model, drives_at_limit(robot, episodes)).parameters}
