@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 from measuring import Rows, add_seeds, parser, read_rows
 
-from deal_hw.calibration import Budget, CalibrationResult
+from deal_hw.calibration import CalibrationResult
 from deal_hw.cli.calibrate import CalibrateDataset, calibrate
 from deal_hw.cli.collect import KINDS as COLLECT
 from deal_hw.cli.collect import collect
@@ -54,7 +54,9 @@ from deal_hw.drivers.cartpole.wire.odrive_link import OdriveSettings
 from deal_hw.errors import DealHwError, InsufficientDataError, UnknownNameError
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.intake import CalibrationInput
+from deal_hw.workflows.calibration.run import calibrate_or_raise
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.calibration.space import without_speed_limits
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.settings import CARTPOLE_RANGE_RATIO
@@ -126,16 +128,10 @@ def measure_virtual(transport: str, profile: str, seed: int) -> dict[str, Any]:
         runs = [demonstrate(virtual, replace(plan, motion=motion))[0] for motion in ("rich", "chirp")]
         fitted, held_out = (fill_gaps(align(run.trajectory, DESCRIPTION)) for run in runs)
         space = without_speed_limits(k9_space(), DESCRIPTION, [run.trajectory for run in runs], silent)
-        found = calibrate_episodes(
-            load_model(DESCRIPTION),
-            space,
-            [fitted],
-            [held_out],
-            method="default",
-            budget=Budget(),
-            rng=np.random.default_rng(seed),
-            threads=1,
+        work = CalibrationInput(
+            robot=load_model(DESCRIPTION), space=space, episodes=[fitted], holdout=[held_out]
         )
+        found = calibrate_or_raise(CalibrateSettings(seed=seed, threads=1), work, "default")
     except DealHwError as error:
         return row | {"error": f"{type(error).__name__}: {error}"}
     latency_s = truth.latency_s + VIRTUAL_WIRE_S.get(transport, 0.0)

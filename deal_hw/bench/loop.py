@@ -28,7 +28,9 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.motions.behaviours import PolicyBehaviour
 from deal_hw.parameters import ParameterDistribution
 from deal_hw.policy import Policy
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.intake import CalibrationInput
+from deal_hw.workflows.calibration.run import calibrate_or_raise
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 from deal_hw.workflows.emulation.virtual import VirtualCartpole
 from deal_hw.workflows.shipped import required_policy
 
@@ -50,18 +52,18 @@ def calibration_row(
     from deal_hw.calib.validation.metrics import HeldOut
 
     d = case
-    result = calibrate_episodes(
-        d.robot,
-        d.space,
-        [d.fit],
-        [],
+    work = CalibrationInput(robot=d.robot, space=d.space, episodes=[d.fit], policy=d.policy)
+    settings = CalibrateSettings(
         method=method,
-        budget=budget,
-        rng=np.random.default_rng(d.seed),
+        population=budget.population,
+        generations=budget.generations,
+        refine=budget.refine,
+        seed=d.seed,
         threads=threads,
-        policy=d.policy,
         engine=engine,
+        starts="recorded",
     )
+    result = calibrate_or_raise(settings, work, method)
     # Play in the gears may have become a parameter.
     found = result.restricted(d.space)
     coverage, width = _intervals(d, found, threads)

@@ -15,8 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from deal_hw.bench.figures import draw
 from deal_hw.bench.rows import Cells, RowTable, noted_in
 from deal_hw.bench.settings import Real
@@ -26,7 +24,7 @@ from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.errors import ConfigurationError
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import CalibrationInput, calibration_input
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.run import calibrate_or_raise
 from deal_hw.workflows.calibration.settings import (
     HELDOUT_PART,
     CalibrateSettings,
@@ -200,21 +198,21 @@ def run_cell(
         "error": "",
     }
     with noted_in(row):
-        result = calibrate_episodes(
-            work.robot,
-            work.space,
-            work.episodes,
-            work.holdout,
+        settings = CalibrateSettings(
             method=method,
-            budget=dataclasses.replace(budget, refine=refine),
-            rng=np.random.default_rng(seed),
+            population=budget.population,
+            generations=budget.generations,
+            refine=refine,
+            seed=seed,
             threads=threads,
-            heldout_window_s=window_s,
-            known_std=expected(method),
+            heldout_window=window_s,
             # An uncalibrated model has no latency.
-            latency_s=0.0 if method == "nominal" else None,
+            latency=0.0 if method == "nominal" else None,
             engine=engine or "mujoco",
         )
+        # Methods are compared in the ranges that the row names.
+        compared = dataclasses.replace(work, known_std=expected(method), guessed=())
+        result = calibrate_or_raise(settings, compared, method)
         row |= result_part(result, window_s)
     return row
 

@@ -13,6 +13,7 @@ import os
 import statistics
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -21,7 +22,9 @@ import numpy as np
 from deal_hw.bench.rows import Cells, Row, RowTable, noted_in, printed
 from deal_hw.bench.settings import Speed
 from deal_hw.bench.tasks import TASKS, Case, check_tasks, make_case
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.intake import CalibrationInput
+from deal_hw.workflows.calibration.run import calibrate_or_raise
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
@@ -110,22 +113,21 @@ def measure(
         many steps, under the policy's and under constant commands, and the ratio to the former.
     """
     from deal_hw.calib.data.problem import Problem
-    from deal_hw.calib.pipeline.methods import usual_budget
     from deal_hw.sim.engine.batch import default_threads
 
+    work = CalibrationInput(robot=case.robot, space=case.space, episodes=[case.fit], policy=case.policy)
+    settings = CalibrateSettings(
+        method=method,
+        population=population,
+        refine=False,
+        seed=case.seed,
+        threads=threads,
+        engine=engine,
+        starts="recorded",
+    )
+
     def search(generations: int) -> CalibrationResult:
-        return calibrate_episodes(
-            case.robot,
-            case.space,
-            [case.fit],
-            [],
-            method=method,
-            budget=usual_budget(method, population, generations, refine=False),
-            rng=np.random.default_rng(case.seed),
-            threads=threads,
-            policy=case.policy,
-            engine=engine,
-        )
+        return calibrate_or_raise(replace(settings, generations=generations), work, method)
 
     # The first search of a process imports torch, which is no part of a search.
     search(1)

@@ -246,7 +246,7 @@ def watching(
     save: Path | None,
     space: ParameterSpace,
     description: RobotDescription,
-    trajectory: Trajectory,
+    trajectory: Trajectory | None,
     latency_s: float | None,
 ) -> Iterator[ProgressCallback | None]:
     """Show a running search until the block ends.
@@ -256,13 +256,13 @@ def watching(
         save: File of the view, .rrd.
         space: The parameters.
         description: The robot.
-        trajectory: The recording whose predictions are shown.
+        trajectory: The recording whose predictions are shown; None for none.
         latency_s: The latency, if it is known [s].
 
     Yields:
         A function to call with the progress; None if nothing is shown.
     """
-    if not watch and save is None:
+    if trajectory is None or (not watch and save is None):
         yield None
         return
     try:

@@ -61,7 +61,9 @@ from deal_hw.testing.plain_faults import (
     Fault,
 )
 from deal_hw.testing.plain_robots import make_robot
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.intake import CalibrationInput
+from deal_hw.workflows.calibration.run import calibrate_or_raise
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 
 STRIBECK_LAW = next(law for law in EXPLANATIONS if law.name == "friction that falls with speed")
 
@@ -102,16 +104,11 @@ def test_play_that_explains_all_becomes_a_parameter() -> None:
     The search that is not needed is long enough to try play in its place.
     """
     robot, problem, _ = truth("pendulum", "backlash")
-    result = calibrate_episodes(
-        problem.robot,
-        problem.space,
-        problem.episodes,
-        problem.episodes[:1],
-        method="default",
-        budget=Budget(population=20, generations=5),
-        rng=np.random.default_rng(0),
-        threads=1,
+    work = CalibrationInput(
+        robot=problem.robot, space=problem.space, episodes=problem.episodes, holdout=problem.episodes[:1]
     )
+    settings = CalibrateSettings(population=20, generations=5, threads=1)
+    result = calibrate_or_raise(settings, work, "default")
     assert result.space.names == (*problem.space.names, "pivot.play") and result.steps < 5_000_000
     assert result.provenance["search"] == "local fit" and result.chi2 < MISMATCH_CHI2
     true = np.array([robot.truth.get(name, PLAY) for name in result.space.names])

@@ -38,11 +38,13 @@ from deal_hw.calib.validation.shared_errors import (
     find_shared_error,
     shared_errors,
 )
-from deal_hw.calibration import Budget, Progress
+from deal_hw.calibration import Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_faults import Fault, SharedFault
 from deal_hw.testing.plain_robots import make_robot, shared_words, write
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.intake import CalibrationInput
+from deal_hw.workflows.calibration.run import calibrate_or_raise
+from deal_hw.workflows.calibration.settings import CalibrateSettings
 
 SAMPLES, JOINTS, ACTUATED = 7, 4, (0, 1, 3)
 
@@ -198,19 +200,10 @@ def test_a_calibration_says_it_first_and_ends_red(tmp_path: Path) -> None:
     """
     wrong = problem("pendulum", "fast-clock", tmp_path, 2.0)
     printed: list[Progress] = []
-    result = calibrate_episodes(
-        wrong.robot,
-        wrong.space,
-        wrong.episodes,
-        (),
-        method="default",
-        budget=Budget(population=8, generations=2),
-        rng=np.random.default_rng(0),
-        threads=1,
-        # So brief a search would leave this check no steps.
-        thorough=True,
-        progress=printed.append,
-    )
+    work = CalibrationInput(robot=wrong.robot, space=wrong.space, episodes=wrong.episodes)
+    # So brief a search would leave the usual checks no steps.
+    settings = CalibrateSettings(population=8, generations=2, threads=1, checks="all")
+    result = calibrate_or_raise(settings, work, "default", progress=printed.append)
     assert any("the clock were 2 times too fast" in p.message for p in printed)
     verdict = trust(result)
     assert result.space.names == wrong.space.names

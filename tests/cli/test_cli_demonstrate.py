@@ -26,7 +26,7 @@ from deal_hw.motions.excitation.level import ExcitationLevelSearch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.recordings.episode import align, fill_gaps
 from deal_hw.workflows.calibration.episodes import choose_episodes
-from deal_hw.workflows.calibration.run import calibrate_episodes
+from deal_hw.workflows.calibration.run import calibrate_or_raise
 from deal_hw.workflows.emulation.process import EmulatorProcess
 from deal_hw.workflows.emulation.virtual import VirtualCartpole, VirtualEpisode, demonstrate
 from deal_hw.workflows.running.plan import RunPlan
@@ -108,10 +108,10 @@ def test_a_row_is_flagged_where_a_parameter_is_given_no_value(monkeypatch: pytes
     def reported(*args: Any, **kwargs: Any) -> CalibrationResult:
         verdicts: list[Identifiability] = ["identifiable"] * 9
         verdicts[7] = "not identifiable"
-        return dataclasses.replace(calibrate_episodes(*args, **kwargs), verdicts=tuple(verdicts), alarms=())
+        return dataclasses.replace(calibrate_or_raise(*args, **kwargs), verdicts=tuple(verdicts), alarms=())
 
     case = make_case("cartpole", "ideal", 3, 3.0)
-    monkeypatch.setattr(bench_loop, "calibrate_episodes", reported)
+    monkeypatch.setattr(bench_loop, "calibrate_or_raise", reported)
     row, _ = bench_loop.calibration_row(case, "midpoint", Budget(refine=False), 1)
     assert row["untold"] == ["servo.effort_limit"] and row["flagged"] and not row["alarms"]
     assert row["excitation_levels"] == list(case.excitation_levels)

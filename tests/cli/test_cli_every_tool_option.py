@@ -22,6 +22,8 @@ from fakes import foreign_policy
 from fakes.foreign_policy import Foreign
 from verb_options import Option, kind_of, options
 
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.validation.metrics import HeldOut
 from deal_hw.cli.main import main, parse
 from deal_hw.cli.verbs import VERBS
 from deal_hw.errors import DealHwError
@@ -400,10 +402,15 @@ def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
     from deal_hw.cli import calibrate
     from deal_hw.workflows.calibration import run as run_calibration
 
-    def search(robot: Any, space: Any, episodes: Any, holdout: Any, **rest: Any) -> Any:
-        rest.pop("progress"), rest.pop("say")
-        searched = (space.names, space.nominal, space.low, space.high, space.known)
-        did.append(reported((robot.model, searched, episodes, holdout, rest)))
+    def search(problem: Problem, searcher: Any, settings: Any, best: Any, results: Any) -> None:
+        space = problem.space
+        names = [f.name for f in dataclasses.fields(problem) if f.init and f.name not in ("robot", "space")]
+        did.append(reported((space.names, space.nominal, space.low, space.high, space.known)))
+        did.append(reported((problem.robot.model, {name: getattr(problem, name) for name in names})))
+        did.append(reported((searcher, settings.budget, settings.seed, results)))
+
+    def check(problem: Any, result: Any, settings: Any, method: str, held_out: HeldOut | None) -> None:
+        did.append(f"{method} {[data.measured.shape for data in held_out._windows] if held_out else None}")
 
     def finish(work: Any, result: Any, results: Any, *settings: Any, **rest: Any) -> None:
         did.append(reported((work.provenance, results, settings, rest)))
@@ -415,7 +422,8 @@ def _calibrate(monkeypatch: pytest.MonkeyPatch, did: list[str]) -> None:
         yield None
 
     monkeypatch.setattr(calibrate, "watching", watching)
-    monkeypatch.setattr(run_calibration, "calibrate_episodes", search)
+    monkeypatch.setattr(run_calibration, "_searched", search)
+    monkeypatch.setattr(run_calibration, "_checked", check)
     monkeypatch.setattr(calibrate, "finish", finish)
 
 
@@ -467,3 +475,9 @@ def test_an_option_changes_something_or_is_refused(
     assert not isinstance(plain[line], DealHwError), plain[line]
     changed = outcome(f"{line} {' '.join(option.words)}")
     assert isinstance(changed, DealHwError) or changed != plain[line], f"{' '.join(option.words)} did nothing"
+
+
+@pytest.mark.parametrize("line", LINES[:2])
+def test_a_calibration_does_the_same_twice(line: str, outcome: Callable[[str], Any]) -> None:
+    """Otherwise an option that does nothing would pass the test above."""
+    assert outcome(line) == outcome(line)

@@ -237,7 +237,8 @@ def test_velocities_that_were_not_recorded_come_from_the_poses(ant: Ant) -> None
     base = "orientation: {columns: [quaternion]}\nbase_position: {columns: [place]}\n"
     work = calibration_input(ant.settings(columns=ant.columns("poses.yaml", base), residual_std=()))
     episode = work.episodes[0]
-    assert episode.measured is not None and np.flatnonzero(episode.measured).size == 14 + 3
+    assert work.shown is not None and episode.measured is not None
+    assert np.flatnonzero(episode.measured).size == 14 + 3
     assert np.isfinite(episode.velocity[:, 3:]).all()
     short = dataclasses.replace(episode, sample=episode.sample[:3])
     with pytest.raises(InsufficientDataError, match="at least 7; record longer"):

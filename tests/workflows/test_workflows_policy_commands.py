@@ -322,6 +322,7 @@ def test_a_datasets_wrong_clock_is_found_before_any_search(
     printed: list[str] = []
     work = calibration_input(settings, say=printed.append)
     assert any("clocks are apart" in line for line in printed)
+    assert work.shown is not None
     begins = work.shown.sent_s[0] - Dataset.open(late).read(0).trajectory.sent_s[0]
     assert abs(begins + 0.6) <= 1.5 / DESCRIPTION.control_rate_hz
     at = np.searchsorted(moved.sent_s, 2.0), np.searchsorted(work.shown.sent_s, 2.0)

@@ -12,7 +12,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,8 +64,8 @@ class CalibrationInput:
         robot: The nominal model.
         space: The parameters to search.
         episodes: Recordings to fit.
-        holdout: Held-out recordings, which only test the result.
-        shown: The recording that ``--watch`` shows.
+        holdout: Held-out recordings, which only test the result; the search never uses them.
+        shown: The recording that ``--watch`` shows; None where nothing is watched.
         telemetry: Verdicts on the recordings, for the report.
         provenance: Sources of the input: plain JSON values.
         advice: How to get a held-out recording if there is none.
@@ -75,17 +75,18 @@ class CalibrationInput:
         policy: The policy that moved the robot all the time, if the method needs it.
         known_std: Expected standard deviation of the prediction error, positions then velocities, (2 C,);
             None: the sensor noise, estimated from the recordings.
-        guessed: Names of the parameters whose range nobody chose; "latency" is the latency.
+        guessed: Names of the parameters whose range nobody chose; "latency" is the latency. See
+            :mod:`deal_hw.calib.pipeline.wider_ranges`.
     """
 
     robot: RobotModel
     space: ParameterSpace
     episodes: Sequence[SampledEpisode]
-    holdout: Sequence[SampledEpisode]
-    shown: Trajectory
-    telemetry: Sequence[str]
-    provenance: Mapping[str, Any]
-    advice: str
+    holdout: Sequence[SampledEpisode] = ()
+    shown: Trajectory | None = None
+    telemetry: Sequence[str] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    advice: str = ""
     balance: Callable[[], Behaviour] | None = None
     name: str = ""
     walks: bool = False
@@ -112,7 +113,7 @@ def calibration_input(settings: CalibrateSettings, *, say: Say = silent) -> Cali
         InsufficientDataError: The recordings are too short, do not move, or do not depend on a parameter.
     """
     settings.check()
-    with _extra("calib"):
+    with extra("calib"):
         return _input_of(_read(settings, say), settings, say)
 
 
@@ -131,7 +132,7 @@ def _read(settings: CalibrateSettings, say: Say) -> Source:
 
 
 @contextlib.contextmanager
-def _extra(name: str) -> Iterator[None]:
+def extra(name: str) -> Iterator[None]:
     """Say which extra installs a package that is missing."""
     try:
         yield

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deal_hw import findings
+from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, make_method, search_of, takes_engine
 from deal_hw.calibration import (
     EXPLAINED_CHI2,
     LATENCY,
-    LATENCY_RANGE_S,
     Z90,
-    Budget,
+    CalibrationMethod,
     CalibrationResult,
     ProgressCallback,
 )
@@ -31,14 +31,13 @@ from deal_hw.errors import (
     DatasetError,
     DealHwError,
     InsufficientDataError,
-    MissingExtraError,
     ModelNotWrittenError,
 )
 from deal_hw.findings import Finding, SafeChecks
 from deal_hw.parameters import ParameterSpace
 from deal_hw.scale.tasks import task_map
-from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.intake import CalibrationInput, extra
 from deal_hw.workflows.calibration.result_folder import (
     HELD_OUT,
     BestSoFar,
@@ -50,13 +49,10 @@ from deal_hw.workflows.calibration.settings import HELDOUT_WINDOW_S, CalibrateSe
 from deal_hw.workflows.say import Say, silent, to_stderr
 
 if TYPE_CHECKING:
-    from deal_hw.calib.data.problem import PopulationPolicy
+    from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldOut, HeldoutErrors
-    from deal_hw.sim.engine.gpu import WantedEngine
-    from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode
-    from deal_hw.workflows.calibration.intake import CalibrationInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +84,7 @@ def calibrate_input(
     say: Say = silent,
     results: ResultFolder | None = None,
 ) -> CalibrationResult:
-    """Calibrate with the settings; see :func:`calibrate_episodes`.
+    """Calibrate with the settings; see :func:`calibrate_or_raise`.
 
     What raises after a fit costs no fit, an hour's work: it is named, and the fit is the result.
     """
@@ -98,6 +94,7 @@ def calibrate_input(
         return err.result
 
 
+@extra("calib")
 def calibrate_or_raise(
     settings: CalibrateSettings,
     work: CalibrationInput,
@@ -107,147 +104,29 @@ def calibrate_or_raise(
     say: Say = silent,
     results: ResultFolder | None = None,
 ) -> CalibrationResult:
-    """Calibrate with the settings; errors as :func:`calibrate_episodes`."""
-    return calibrate_episodes(
-        work.robot,
-        work.space,
-        work.episodes,
-        work.holdout,
-        method=method,
-        budget=settings.budget,
-        thorough=settings.checks == "all",
-        laws=settings.laws,
-        rng=np.random.default_rng(settings.seed),
-        latency_s=settings.latency,
-        latency_range_s=settings.latency_range,
-        threads=settings.threads,
-        progress=progress,
-        say=say,
-        results=results,
-        known_std=work.known_std,
-        heldout_window_s=settings.heldout_window,
-        policy=work.policy,
-        smoothing_s=work.smoothing_s,
-        starts=settings.starts,
-        start_std=dict(settings.start_std),
-        tasks=task_map(settings.ray),
-        engine=settings.engine,
-        guessed=work.guessed,
-    )
-
-
-def calibrate_episodes(
-    robot: RobotModel,
-    space: ParameterSpace,
-    episodes: Sequence[SampledEpisode],
-    holdout: Sequence[SampledEpisode],
-    *,
-    method: str,
-    budget: Budget,
-    rng: np.random.Generator,
-    latency_s: float | None = None,
-    latency_range_s: tuple[float, float] = LATENCY_RANGE_S,
-    threads: int | None = None,
-    progress: ProgressCallback | None = None,
-    say: Say = silent,
-    results: ResultFolder | None = None,
-    known_std: FloatArray | None = None,
-    heldout_window_s: float = HELDOUT_WINDOW_S,
-    smoothing_s: float | None = None,
-    policy: PopulationPolicy | None = None,
-    starts: Literal["recorded", "drawn"] | None = "recorded",
-    start_std: Mapping[str, float] | None = None,
-    thorough: bool = False,
-    tasks: TaskMap | None = None,
-    laws: bool = True,
-    engine: WantedEngine = "mujoco",
-    guessed: tuple[str, ...] = (),
-) -> CalibrationResult:
     """Calibrate from recordings on the device's time grid, without writing results.
 
     Args:
-        robot: The nominal model.
-        space: The parameters to search.
-        episodes: Recordings to fit.
-        holdout: Recordings that only test the result; the search never uses them.
-        method: Name of the method.
-        budget: How much it may use.
-        rng: The only source of randomness.
-        latency_s: Total latency if it is known [s].
-        latency_range_s: Otherwise the range of its search [s].
-        threads: Simulation threads.
+        settings: How to search and to judge. What they say of files and of the space is in the input already.
+        work: Robot, parameters and recordings.
+        method: Name of the method, by default that of
+            :func:`~deal_hw.workflows.calibration.intake.usual_method`.
         progress: Called with the progress.
         say: Called with a sentence on each better fit, and on its file.
         results: Folder for the state after each generation, and on Ctrl-C for the best fit so far; None:
             nothing is written.
-        known_std: Standard deviation of the prediction error, positions then velocities, (2 C,); None: the
-        sensor noise, estimated from the recordings.
-        heldout_window_s: Held-out predictions restart from the measured state after this time [s].
-        smoothing_s: Time over which start states are smoothed [s]; None for the default.
-        policy: The policy that moved the robot all the time, for methods that need it.
-        starts: Where rollouts of the policy begin: in the recorded first state, or in drawn states; None:
-            drawn ones where the recordings do not show the first state well.
-        start_std: Standard deviation of entries of drawn start states, by name; others have the recordings'
-            own.
-        thorough: Run checks to their end where they take more physics steps than the fits.
-        tasks: Does fits that do not depend on each other; None: this process.
-        laws: Take a law that the model lacks where it predicts better.
-        engine: What simulates the population of a search.
-        guessed: Names of the parameters whose range nobody chose; see
-            :mod:`deal_hw.calib.pipeline.wider_ranges`.
 
     Raises:
+        ConfigurationError: A setting cannot be used with this robot or these recordings.
+        InsufficientDataError: The recordings are too short, or do not show what is asked for.
         UnfinishedCalibrationError: Something raised after the first fit; the error has that fit.
     """
-    try:
-        from threadpoolctl import threadpool_limits
+    from deal_hw.calib.validation.metrics import HeldOut
 
-        from deal_hw.calib.data.checks import check_delays, target_changes
-        from deal_hw.calib.data.effort_checks import check_efforts
-        from deal_hw.calib.data.noise import SMOOTHING_S
-        from deal_hw.calib.data.problem import Problem
-        from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
-        from deal_hw.calib.pipeline.methods import (
-            CLOSED_LOOP_METHODS,
-            make_method,
-            search_of,
-            takes_engine,
-        )
-        from deal_hw.calib.validation.metrics import HeldOut
-    except ModuleNotFoundError as err:
-        raise MissingExtraError(str(err.name), "calib") from err
-
-    _require_windows(holdout, heldout_window_s)
-    if latency_s is None and not target_changes(episodes):
-        latency_s = 0.0
-        say("no command ever changes, so the recordings do not show the latency: it is taken as 0")
-    problem = Problem(
-        robot,
-        space,
-        episodes,
-        threads=threads,
-        latency_range_s=latency_range_s,
-        fixed_latency_s=latency_s,
-        known_std=known_std,
-        smoothing_s=SMOOTHING_S if smoothing_s is None else smoothing_s,
-        policy=policy,
-        tasks=tasks or InThisProcess(),
-        guessed=guessed,
-    )
-    if engine != "mujoco":
-        from deal_hw.sim.engine.warp_support import choose_engine
-
-        without = "" if takes_engine(method) else method
-        problem.engine = choose_engine(engine, robot, budget.population, "the search", say, without, space)
-    check_delays(problem)
-    check_efforts(problem)
-    in_loop = policy is not None and search_of(method) in CLOSED_LOOP_METHODS
-    if in_loop:
-        from deal_hw.workflows.calibration.starts import chosen_starts
-
-        problem.start_std = chosen_starts(problem, starts, start_std or {}, say)
-
-    held_out = HeldOut(robot, space, holdout, heldout_window_s, threads) if holdout else None
+    _require_windows(work.holdout, settings.heldout_window)
+    problem = _problem(settings, work, method, say)
+    window_s, threads = settings.heldout_window, settings.threads
+    held_out = HeldOut(work.robot, work.space, work.holdout, window_s, threads) if work.holdout else None
 
     def judge(theta: FloatArray, latency: float, of: ParameterSpace) -> Mapping[str, float]:
         return {} if held_out is None else _errors(held_out.of(of), theta, latency).nrmse
@@ -256,9 +135,72 @@ def calibrate_episodes(
     if results is not None:
         if not results.resume:
             results.clear_so_far()
-        keeps = {"keep": partial(results.keep, robot), "next_step": lambda: results.next_step}
-    best = BestSoFar(space, judge, say, progress, **keeps)
-    searcher = make_method(method, refine=budget.refine, thorough=thorough, laws=laws)
+        keeps = {"keep": partial(results.keep, work.robot), "next_step": lambda: results.next_step}
+    best = BestSoFar(work.space, judge, say, progress, **keeps)
+    thorough = settings.checks == "all"
+    searcher = make_method(method, refine=settings.budget.refine, thorough=thorough, laws=settings.laws)
+    result = _searched(problem, searcher, settings, best, results)
+    return _checked(problem, result, settings, method, held_out)
+
+
+def _problem(settings: CalibrateSettings, work: CalibrationInput, method: str, say: Say) -> Problem:
+    """Return the calibration problem, checked, with the engine and the start states of the method."""
+    from deal_hw.calib.data.checks import check_delays, target_changes
+    from deal_hw.calib.data.effort_checks import check_efforts
+    from deal_hw.calib.data.noise import SMOOTHING_S
+    from deal_hw.calib.data.problem import Problem
+
+    latency_s = settings.latency
+    if latency_s is None and not target_changes(work.episodes):
+        latency_s = 0.0
+        say("no command ever changes, so the recordings do not show the latency: it is taken as 0")
+    problem = Problem(
+        work.robot,
+        work.space,
+        work.episodes,
+        threads=settings.threads,
+        latency_range_s=settings.latency_range,
+        fixed_latency_s=latency_s,
+        known_std=work.known_std,
+        smoothing_s=SMOOTHING_S if work.smoothing_s is None else work.smoothing_s,
+        policy=work.policy,
+        tasks=task_map(settings.ray),
+        guessed=work.guessed,
+    )
+    if settings.engine != "mujoco":
+        from deal_hw.sim.engine.warp_support import choose_engine
+
+        without, members = "" if takes_engine(method) else method, settings.budget.population
+        problem.engine = choose_engine(
+            settings.engine, work.robot, members, "the search", say, without, work.space
+        )
+    check_delays(problem)
+    check_efforts(problem)
+    if _in_loop(problem, method):
+        from deal_hw.workflows.calibration.starts import chosen_starts
+
+        problem.start_std = chosen_starts(problem, settings.starts, dict(settings.start_std), say)
+    return problem
+
+
+def _in_loop(problem: Problem, method: str) -> bool:
+    """Return whether the method runs the policy that moved the robot, which is known."""
+    return problem.policy is not None and search_of(method) in CLOSED_LOOP_METHODS
+
+
+def _searched(
+    problem: Problem,
+    searcher: CalibrationMethod[Problem],
+    settings: CalibrateSettings,
+    best: BestSoFar,
+    results: ResultFolder | None,
+) -> CalibrationResult:
+    """Run the method; Ctrl-C writes the best fit so far."""
+    from threadpoolctl import threadpool_limits
+
+    from deal_hw.calib.data.resume import SearchCheckpoint, run_identity
+
+    budget, rng = settings.budget, np.random.default_rng(settings.seed)
     # The matrices are small: a second BLAS thread only spins, and on shared processors each decomposition
     # then takes ten times as long.
     with threadpool_limits(1, user_api="blas"), problem.tasks:
@@ -270,7 +212,7 @@ def calibrate_episodes(
             result = searcher.run(problem, budget, rng, best, store)
         except KeyboardInterrupt:
             if results is not None and best.result is not None:
-                results.write(robot, best.ended("was stopped"), stopped=True)
+                results.write(problem.robot, best.ended("was stopped"), stopped=True)
                 to_stderr(f"\nbest so far: {best.sentence}; written to {results.so_far}, not checked")
             raise
         except Exception as err:
@@ -280,17 +222,27 @@ def calibrate_episodes(
             ended = best.ended(how, "Report this error.")
             raise UnfinishedCalibrationError(f"the calibration {how}", ended) from err
         best.take(result)
-    safely = SafeChecks()
+    return result
+
+
+def _checked(
+    problem: Problem,
+    result: CalibrationResult,
+    settings: CalibrateSettings,
+    method: str,
+    held_out: HeldOut | None,
+) -> CalibrationResult:
+    """Return the result with the alarm on its latency, its start states and its held-out errors."""
     from deal_hw.calib.validation.checks import latency_alarms
 
-    provenance = result.provenance
+    safely, provenance = SafeChecks(), result.provenance
     first, last = provenance.get("grown_ranges", {}).get(LATENCY, problem.latency_range_s)
     more = safely.run("the latency's range", (), latency_alarms, problem, result.latency_s, (first, last))
-    if in_loop:
+    if _in_loop(problem, method):
         provenance = {
             **provenance,
             "start_states": "recorded" if problem.start_std is None else "drawn",
-            "start_std": dict(start_std or {}),
+            "start_std": dict(settings.start_std),
         }
     result = dataclasses.replace(result, alarms=(*result.alarms, *more), provenance=provenance)
     if held_out is not None:
