@@ -11,7 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -180,9 +180,13 @@ class PopulationPolicy(Protocol):
         ...
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Recordings, simulator and parameters.
+    """Recordings, their noise, a simulator, and parameters; none of them changes.
+
+    A method that needs another problem makes one. ``dataclasses.replace`` begins anew: noise and start states
+    are estimated from the recordings. :meth:`sharing`, and the methods that call it, estimate nothing again.
+    Only the count of physics steps goes on, in an object that shared problems have in common.
 
     Attributes:
         robot: The nominal model.
@@ -227,15 +231,14 @@ class Problem:
     channels: IntArray = field(init=False)
     noise_std: FloatArray = field(init=False)
     noise: NoiseModel = field(init=False)
-    starts: list[StartStates] = field(init=False)
-    trees: list[IntArray] = field(init=False)
+    starts: tuple[StartStates, ...] = field(init=False)
+    trees: tuple[IntArray, ...] = field(init=False)
     engine: EngineName = "mujoco"
     guessed: tuple[str, ...] = ()
     _batches: BatchPool = field(init=False)
 
     def __post_init__(self) -> None:
-        self.robot, self.episodes = in_own_setups(self.robot, self.episodes, self.space)
-        self._batches = BatchPool(self.robot, self.space, self.threads)
+        robot, episodes = in_own_setups(self.robot, self.episodes, self.space)
         given = () if self.fixed_latency_s is None else (self.fixed_latency_s,)
         (low, high), longest = self.latency_range_s, LONGEST_LATENCY_S
         if not (0 <= low < high <= longest and all(0 <= latency_s <= longest for latency_s in given)):
@@ -243,22 +246,47 @@ class Problem:
                 f"latency {' to '.join(f'{1e3 * v:g}' for v in given or (low, high))} ms: a range is two "
                 f"different values, the lower one first; no robot is later than {1e3 * longest:g} ms"
             )
-        self.latency_range_s = (min((low, *given)), max((high, *given)))
-        if not self.episodes:
+        if not episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
-        self.episodes = [fill_gaps(e) for e in self.episodes]
-        states = self.episodes[0].channels
-        if any(not np.array_equal(e.channels, states) for e in self.episodes):
+        states = episodes[0].channels
+        if any(not np.array_equal(e.channels, states) for e in episodes):
             raise ConfigurationError("the recordings measure different channels; calibrate them one by one")
-        self.efforts = effort_joints(self.robot.description, self.space)
+        self._set(
+            robot=robot,
+            episodes=tuple(fill_gaps(e) for e in episodes),
+            latency_range_s=(min((low, *given)), max((high, *given))),
+            efforts=effort_joints(robot.description, self.space),
+            _batches=BatchPool(robot, self.space, self.threads),
+        )
         first = 2 * self.coordinates
-        self.channels = np.append(states, np.arange(first, first + len(self.efforts), dtype=states.dtype))
-        self.noise_std = self._white_noise()
-        rotation = self.robot.rotation
-        self.starts = [smooth_states(e, self.noise_std, rotation, self.smoothing_s) for e in self.episodes]
-        self.noise = self._noise_model()
-        models = [self.robot.in_setup(e.setup) for e in self.episodes]
-        self.trees = [independent_trees(m, e.position) for m, e in zip(models, self.episodes, strict=True)]
+        efforts = np.arange(first, first + len(self.efforts), dtype=states.dtype)
+        self._set(channels=np.append(states, efforts))
+        # Start states are smoothed with the noise, and the jitter of sample times shows where they move.
+        std = self._white_noise()
+        starts = tuple(smooth_states(e, std, robot.rotation, self.smoothing_s) for e in self.episodes)
+        self._set(noise_std=std, starts=starts)
+        self._set(noise=self._noise_model())
+        models = [robot.in_setup(e.setup) for e in self.episodes]
+        trees = (independent_trees(m, e.position) for m, e in zip(models, self.episodes, strict=True))
+        self._set(trees=tuple(trees))
+
+    def _set(self, **values: Any) -> None:
+        """Set fields of a new problem, before anybody else has it."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def sharing(self, **changes: Any) -> Problem:
+        """Return the problem with other values of some fields; nothing is estimated from recordings again.
+
+        Noise, start states and simulators are shared. Another robot, space or number of threads makes other
+        simulators, with the same count of steps.
+        """
+        other = copy.copy(self)
+        other._set(**changes)
+        if not changes.keys().isdisjoint({"robot", "space", "threads"}):
+            counted = self._batches.counted
+            other._set(_batches=BatchPool(other.robot, other.space, other.threads, counted=counted))
+        return other
 
     def _white_noise(self) -> FloatArray:
         size, states = 2 * self.coordinates, self.episodes[0].channels
@@ -337,33 +365,23 @@ class Problem:
 
     def on_one_thread(self) -> Problem:
         """Return the problem for a worker: on one thread, and without the policy, which cannot be sent."""
-        other = copy.copy(self)
-        other.threads, other.policy, other._batches = 1, None, BatchPool(self.robot, self.space, 1)
-        return other
+        return self.sharing(threads=1, policy=None)
 
     def part(self, chosen: Sequence[Mask]) -> Problem:
-        """Return the problem with only the samples under one mask per recording, (T,), usable.
-
-        Noise, smoothed states and simulators are shared; nothing is estimated again.
-        """
-        other = copy.copy(self)
-        other.episodes = [
-            dataclasses.replace(e, usable=e.usable & mask)
-            for e, mask in zip(self.episodes, chosen, strict=True)
-        ]
-        return other
+        """Return the problem with only the samples under one mask per recording, (T,), usable."""
+        masked = zip(self.episodes, chosen, strict=True)
+        return self.sharing(
+            episodes=tuple(dataclasses.replace(e, usable=e.usable & mask) for e, mask in masked)
+        )
 
     def on(self, episodes: Sequence[SampledEpisode], known_std: FloatArray | None) -> Problem:
         """Return the problem of other recordings; noise is estimated again, simulators are shared."""
         other = dataclasses.replace(self, episodes=episodes, known_std=known_std)
-        other._batches = self._batches
-        return other
+        return other.sharing(_batches=self._batches)
 
     def with_noise(self, scale: FloatArray) -> Problem:
         """Return the problem with the noise of each channel multiplied by ``scale``, (M,)."""
-        other = copy.copy(self)
-        other.noise = NoiseModel(self.noise.position_std * scale, self.noise.timing_std_s)
-        return other
+        return self.sharing(noise=NoiseModel(self.noise.position_std * scale, self.noise.timing_std_s))
 
     def with_command_delays(
         self, delays: CommandDelays | None, episodes: Sequence[SampledEpisode] | None = None
@@ -372,33 +390,25 @@ class Problem:
 
         ``episodes`` are the same recordings with moved commands.
         """
-        other = copy.copy(self)
-        other.command_delays = delays
-        other.episodes = self.episodes if episodes is None else episodes
-        return other
+        moved = self.episodes if episodes is None else tuple(episodes)
+        return self.sharing(command_delays=delays, episodes=moved)
 
     def with_space(self, space: ParameterSpace) -> Problem:
         """Return the problem with other parameters or ranges; recordings and noise are shared."""
-        other = copy.copy(self)
-        other.space = space
-        other.robot, other.episodes = in_own_setups(self.robot, self.episodes, space)
-        other._batches = BatchPool(other.robot, space, self.threads, counted=self._batches.counted)
-        return other
+        robot, episodes = in_own_setups(self.robot, self.episodes, space)
+        return self.sharing(space=space, robot=robot, episodes=tuple(episodes))
 
     def with_more(self, parameters: Sequence[Parameter]) -> Problem:
         """Return the problem with more parameters after its own."""
         other = self.with_space(ParameterSpace((*self.space.parameters, *parameters)))
-        if self.command_delays is not None:
-            theta = np.append(self.command_delays.theta, [p.nominal for p in parameters])
-            other.command_delays = dataclasses.replace(self.command_delays, theta=theta)
-        return other
+        if self.command_delays is None:
+            return other
+        theta = np.append(self.command_delays.theta, [p.nominal for p in parameters])
+        return other.sharing(command_delays=dataclasses.replace(self.command_delays, theta=theta))
 
     def with_robot(self, robot: RobotModel) -> Problem:
         """Return the problem with another model of the same robot; the rest is shared."""
-        other = copy.copy(self)
-        other.robot = robot
-        other._batches = BatchPool(robot, self.space, self.threads, counted=self._batches.counted)
-        return other
+        return self.sharing(robot=robot)
 
     @property
     def first_latency_s(self) -> float:

@@ -17,7 +17,6 @@ Held-out recordings take no part in any of this.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -365,8 +364,7 @@ class OutputErrorFits(Fits):
         on = problem
         if search and problem.policy is not None:
             # A search may run the policy, whose network cannot be sent.
-            on = copy.copy(problem)
-            on.tasks = InThisProcess()
+            on = problem.sharing(tasks=InThisProcess())
         say = partial(_say_fold, run, len(masks))
         found = on_folds(on, masks, fits, errors, "long", settings.long_s, say)
         decided = LawfulChoice(found) if found.note else self._with_laws(run, problem, laws, found)

@@ -50,9 +50,9 @@ def grown_ranges(
 def _wider(problem: Problem, sides: Mapping[str, int]) -> Problem:
     """Return the problem with ranges that go on at these ends, by parameter."""
     found = problem.with_space(wider(problem.space, {n: side for n, side in sides.items() if n != LATENCY}))
-    if LATENCY in sides:
-        found.latency_range_s = wider_latency(problem.latency_range_s, sides[LATENCY])
-    return found
+    if LATENCY not in sides:
+        return found
+    return found.sharing(latency_range_s=wider_latency(problem.latency_range_s, sides[LATENCY]))
 
 
 def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[CalibrationRun, Refined]:

@@ -113,7 +113,7 @@ def test_robust_fit_shrugs_off_wild_samples(
         fixed_latency_s=noisy.latency_s,
     )
     # The noise is that of the clean recording: an outlier is what noise does not make.
-    spoilt.noise, spoilt.starts = noisy_problem.noise, noisy_problem.starts
+    spoilt = spoilt.sharing(noise=noisy_problem.noise, starts=noisy_problem.starts)
     start, equal = (noisy_refined.theta, noisy.latency_s), Recipe(seconds=0.2)
     clean, plain = (fit_output_error(p, *start, equal) for p in (noisy_problem, spoilt))
     assert kurtosis(plain.normal.residual) > 6.0

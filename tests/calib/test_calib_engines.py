@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from importlib.util import find_spec
 from typing import Any
 
@@ -22,7 +21,6 @@ from deal_hw.calib.search.deal import Deal
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calibration import Budget, CalibrationResult
 from deal_hw.sim.engine import batch as simulators
-from deal_hw.sim.engine.batch import BatchPool
 from deal_hw.sim.engine.engines import Engine, MujocoEngine
 from deal_hw.sim.engine.gpu import EngineName
 
@@ -54,9 +52,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
 
 def on(problem: Problem, engine: EngineName) -> Problem:
     """Return the problem with its populations on an engine."""
-    other = copy.copy(problem)
-    other.engine, other._batches = engine, BatchPool(problem.robot, problem.space, 1)
-    return other
+    return problem.sharing(engine=engine, threads=1)
 
 
 def searched(problem: Problem, search: Search) -> CalibrationResult:

@@ -62,9 +62,7 @@ class Pickled(TaskMap):
 @pytest.fixture
 def both(small_problem: Callable[..., Problem]) -> tuple[Problem, Problem]:
     """The same problem twice: fits here, and fits in workers."""
-    here, there = small_problem(), small_problem()
-    there.tasks = Pickled()
-    return here, there
+    return small_problem(), small_problem().sharing(tasks=Pickled())
 
 
 def _simulated(problem: Problem, factor: float) -> float:
@@ -124,16 +122,15 @@ def test_a_population_is_shared_by_more_workers_than_threads(
     both: tuple[Problem, Problem], workers: int, tasks: int
 ) -> None:
     """The same bits and steps; a worker that is no more than this process's thread brings nothing."""
-    here, there = both
-    there.tasks, here.threads, there.threads = Pickled(workers), 1, 1
+    here, there = both[0].sharing(threads=1), both[1].sharing(threads=1, tasks=Pickled(workers))
     data = here.windows(8)[0]
     theta = here.space.nominal * np.linspace(0.5, 1.5, 7)[:, None]
     members = Members(theta, np.linspace(-0.002, 0.02, 7))
     moved = data.start_position + 0.01, data.start_velocity - 0.01
     for starts in ((), moved):
-        found = [predict_population(problem, members, data, *starts) for problem in both]
+        found = [predict_population(problem, members, data, *starts) for problem in (here, there)]
         assert found[0].tobytes() == found[1].tobytes() and np.isfinite(found[0]).all()
-    assert there.tasks.done == 2 * tasks
+    assert isinstance(there.tasks, Pickled) and there.tasks.done == 2 * tasks
     assert here.steps == there.steps > 0
 
 
@@ -146,9 +143,8 @@ def test_searches(both: tuple[Problem, Problem], method: str, noise: float | Non
         problem = exact
         if noise is not None:
             problem = dataclasses.replace(exact, known_std=np.full(4, noise))
-        problem.threads = 1
-        if exact is both[1]:
-            problem.tasks = Pickled(2)
+        tasks = Pickled(2) if exact is both[1] else problem.tasks
+        problem = problem.sharing(threads=1, tasks=tasks)
         budget = Budget(population=8, generations=4, refine=False)
         found = make_method(method, refine=False).run(problem, budget, np.random.default_rng(0))
         results.append((found.estimate.tobytes(), found.chi2, problem.steps))

@@ -127,7 +127,7 @@ def test_a_range_that_nobody_chose_does_not_end_a_fit_that_an_expected_value_hol
     prior = {"prior_mean": 0.2, "prior_std": 1.0} if expected else {"prior_mean": None, "prior_std": None}
     damping = dataclasses.replace(given["hinge.damping"], **prior)
     narrow = problem.with_space(ParameterSpace([damping, *given.parameters[1:]]))
-    narrow.guessed = ("hinge.damping",) if guessed else ()
+    narrow = narrow.sharing(guessed=("hinge.damping",) if guessed else ())
     fit = fit_beyond_ends(narrow, (narrow.space.nominal, 0.0), Recipe())
     assert fit.theta[0] == pytest.approx(TRUTH[0] if beyond else TRUTH[0] / 2, rel=0.02)
     assert bool(fit.plain.problem.space["hinge.damping"].high > TRUTH[0]) is beyond
@@ -151,8 +151,7 @@ def test_the_robust_loss_shrugs_off_a_stretch_that_no_model_has(problem: Problem
     held[60:85] += 0.2
     spoilt = dataclasses.replace(
         problem, episodes=[dataclasses.replace(first, position=held), *problem.episodes[1:]]
-    )
-    spoilt.starts = problem.starts
+    ).sharing(starts=problem.starts)
     plain, robust = (
         fit_output_error(spoilt, TRUTH, LATE_S, Recipe(seconds=1.0, robust=wanted))
         for wanted in (False, True)
@@ -177,8 +176,7 @@ def test_intervals_count_the_correlation_of_residuals_once(problem: Problem) -> 
             dataclasses.replace(e, position=e.position + 1e-3 * lasting_noise(rng, len(e.position)))
             for e in problem.episodes
         ]
-        spoilt = dataclasses.replace(problem, episodes=drifting)
-        spoilt.starts = problem.starts
+        spoilt = dataclasses.replace(problem, episodes=drifting).sharing(starts=problem.starts)
         fit = fit_output_error(spoilt, TRUTH, LATE_S, Recipe(), central=True)
         assert fit.normal.cost == pytest.approx(fit.normal.count, rel=0.05)
         known = uncertainty_at(problem, fit, own_scale=True)
@@ -277,8 +275,10 @@ def test_a_robot_that_stands_still_is_what_fits_that_explain_nothing_are_compare
     T = len(first.sample)
     moving = dataclasses.replace(problem, episodes=[first])
     position: FloatArray = first.period_s * np.arange(T, dtype=np.float64)[:, None]
-    moving.episodes = [dataclasses.replace(first, position=position)]
-    moving.starts = [dataclasses.replace(moving.starts[0], position=position, velocity=np.ones((T, 1)))]
+    moving = moving.sharing(
+        episodes=(dataclasses.replace(first, position=position),),
+        starts=(dataclasses.replace(moving.starts[0], position=position, velocity=np.ones((T, 1))),),
+    )
     found = standing_rmse(moving, 4 * first.period_s)
     assert found == pytest.approx(first.period_s * np.sqrt(np.mean(np.arange(1, 5) ** 2)), rel=1e-6)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -181,9 +180,7 @@ def test_the_ratio_of_variances_by_hand() -> None:
 
 def _with_jitter(problem: Problem, std_s: float) -> Problem:
     """Return the problem as if its sample times jittered, with the noise that it has."""
-    other = copy.copy(problem)
-    other.noise = NoiseModel(problem.noise.position_std, std_s)
-    return other
+    return problem.sharing(noise=NoiseModel(problem.noise.position_std, std_s))
 
 
 def test_commands_may_jitter_as_much_as_the_residual_leaves_possible(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -153,8 +152,7 @@ def test_independent_pendulums_share_simulations(tmp_path: Path, central: bool) 
     work = calibration_input(settings)
     problem = Problem(work.robot, work.space, work.episodes, threads=1)
     assert problem.trees[0].tolist() == [0, 1] and len(problem.space) == 10
-    alone = copy.copy(problem)
-    alone.trees = [np.zeros(2, dtype=np.int64)]
+    alone = problem.sharing(trees=(np.zeros(2, dtype=np.int64),))
     steps, found = [], []
     for of in (problem, alone):
         shooting = Shooting(of, 20)

@@ -104,7 +104,7 @@ def test_members_begin_in_states_of_their_own(case: Case, history: int) -> None:
     """Each lies where the draws put it; the same in all generations, and nothing moves without a spread."""
     problem, theta = problem_of(case)
     members = Members(np.repeat(theta[None], 40, axis=0), np.zeros(40))
-    problem.start_std = given_std(problem, {"pole.velocity": 0.2})
+    problem = problem.sharing(start_std=given_std(problem, {"pole.velocity": 0.2}))
     views = [RolloutView(problem, FitnessSettings(ticks=50), np.random.default_rng(3)) for _ in range(2)]
     first, usable = views[0].rollouts(members)
     np.testing.assert_array_equal(first, views[0].rollouts(members)[0])
@@ -117,8 +117,7 @@ def test_members_begin_in_states_of_their_own(case: Case, history: int) -> None:
     position, velocity, _ = rollout_population(problem, members, 0, part, moved=moved)
     np.testing.assert_allclose(velocity[:, 0, 1], case.fit.velocity[part.sample[0], 1] + moved[:, 3])
     np.testing.assert_allclose(position[:, 0], np.tile(case.fit.position[part.sample[0]], (40, 1)))
-    problem.start_std = None
-    plain = RolloutView(problem, FitnessSettings(ticks=50), np.random.default_rng(3))
+    plain = RolloutView(problem.sharing(start_std=None), FitnessSettings(ticks=50), np.random.default_rng(3))
     assert np.ptp(plain.rollouts(members)[0], axis=0).max() == 0
 
 
@@ -180,8 +179,7 @@ def test_drawn_states_find_the_truth_although_the_first_state_is_wrong(case: Cas
     method, budget = make_method("moments-unaligned"), Budget(population=20, generations=12)
     errors = {}
     for name, std in (("recorded", None), ("drawn", given_std(problem, {}))):
-        problem.start_std = std
-        found = method.run(problem, budget, np.random.default_rng(0))
+        found = method.run(problem.sharing(start_std=std), budget, np.random.default_rng(0))
         errors[name] = np.abs(np.log(found.estimate / theta))
     assert np.all(errors["drawn"] < 0.05)
     assert np.all(errors["recorded"] > 0.1)

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
     from deal_hw.calib.report.gather import ReportInputs
     from deal_hw.calib.validation.metrics import HeldOut, HeldoutErrors
+    from deal_hw.sim.engine.gpu import EngineName
     from deal_hw.sim.recordings.episode import SampledEpisode
 
 
@@ -154,6 +155,12 @@ def _problem(settings: CalibrateSettings, work: CalibrationInput, method: str, s
     if latency_s is None and not target_changes(work.episodes):
         latency_s = 0.0
         say("no command ever changes, so the recordings do not show the latency: it is taken as 0")
+    engine: EngineName = "mujoco"
+    if settings.engine != "mujoco":
+        from deal_hw.sim.engine.warp_support import choose_engine
+
+        without, members = "" if takes_engine(method) else method, settings.budget.population
+        engine = choose_engine(settings.engine, work.robot, members, "the search", say, without, work.space)
     problem = Problem(
         work.robot,
         work.space,
@@ -165,21 +172,16 @@ def _problem(settings: CalibrateSettings, work: CalibrationInput, method: str, s
         smoothing_s=SMOOTHING_S if work.smoothing_s is None else work.smoothing_s,
         policy=work.policy,
         tasks=task_map(settings.ray),
+        engine=engine,
         guessed=work.guessed,
     )
-    if settings.engine != "mujoco":
-        from deal_hw.sim.engine.warp_support import choose_engine
-
-        without, members = "" if takes_engine(method) else method, settings.budget.population
-        problem.engine = choose_engine(
-            settings.engine, work.robot, members, "the search", say, without, work.space
-        )
     check_delays(problem)
     check_efforts(problem)
     if _in_loop(problem, method):
         from deal_hw.workflows.calibration.starts import chosen_starts
 
-        problem.start_std = chosen_starts(problem, settings.starts, dict(settings.start_std), say)
+        std = chosen_starts(problem, settings.starts, dict(settings.start_std), say)
+        problem = problem.sharing(start_std=std)
     return problem
 
 
