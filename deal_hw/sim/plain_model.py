@@ -76,7 +76,7 @@ def _with_laws(
     # The laws write into their model.
     model = copy.copy(calibrated)
     data = mujoco.MjData(model)
-    data.qpos[list(robot.qpos)], data.qvel[list(robot.qvel)] = position, speed
+    robot.place(data.qpos, position, data.qvel, speed)
     laws = ActuatorLaws(model, data)
     laws.restart(command[0])
     path = np.empty((len(command), len(robot.qpos)))
@@ -93,7 +93,7 @@ def _alone(
     model, paths = mujoco.MjModel.from_xml_path(str(plain)), []
     for position, speed, command in motions:
         data = mujoco.MjData(model)
-        data.qpos[list(robot.qpos)], data.qvel[list(robot.qvel)] = position, speed
+        robot.place(data.qpos, position, data.qvel, speed)
         hold(model, data, command[0] / per_ctrl)
         path = np.empty((len(command), len(robot.qpos)))
         for step, now in enumerate(command / per_ctrl):

@@ -36,7 +36,8 @@ def derived_robot(model: Path, name: str, tables: Sequence[Table]) -> UserRobot 
         return None
     rate_hz = 1 / common_period(tables)
     try:
-        robot = derive_robot(model, name=name, control_rate_hz=rate_hz, several_trees=True)
+        read = {joint for table in tables for joint in table.joint_names}
+        robot = derive_robot(model, name=name, control_rate_hz=rate_hz, several_trees=True, recorded=read)
         for table in tables:
             _check_joints(robot, table)
     except ConfigurationError as err:

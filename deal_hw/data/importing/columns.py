@@ -231,11 +231,13 @@ class JointKinds:
         motors: Those driven by a motor, each with its effort at its highest command [N or N·m].
         speeds: Those driven by a velocity servo, each with its effort an error of the speed [N·s/m or
             N·m·s/rad].
+        followers: Those that need no reading, as an equality of the model moves them with others.
     """
 
     slides: frozenset[str] = frozenset()
     motors: Mapping[str, float] = field(default_factory=dict)
     speeds: Mapping[str, float] = field(default_factory=dict)
+    followers: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,7 +51,10 @@ class _Guess:
 
 
 def guess_columns(
-    channels: Channels, joints: Sequence[str] | None = None, time: TimeColumn | None = None
+    channels: Channels,
+    joints: Sequence[str] | None = None,
+    time: TimeColumn | None = None,
+    followers: Collection[str] = (),
 ) -> ColumnMap:
     """Guess what the channels of a file mean.
 
@@ -64,6 +67,7 @@ def guess_columns(
         channels: The file's channels.
         joints: Names of the model's joints; None: the file's names.
         time: The time; None: guessed, too.
+        followers: Those of these joints that a file may lack.
 
     Raises:
         DatasetError: No time or no joint can be found; the message names the channels.
@@ -80,7 +84,7 @@ def guess_columns(
         if guess.role and not guess.stem and channels.is_wide(guess.channel)
     }
     if "position" in arrays:
-        return _from_arrays(channels, time, arrays, joints)
+        return _from_arrays(channels, time, arrays, joints, followers)
     return _from_columns(channels, time, guesses, joints)
 
 
@@ -135,7 +139,11 @@ def _key(name: str) -> tuple[str, ...]:
 
 
 def _from_arrays(
-    channels: Channels, time: TimeColumn, arrays: dict[str, _Guess], joints: Sequence[str] | None
+    channels: Channels,
+    time: TimeColumn,
+    arrays: dict[str, _Guess],
+    joints: Sequence[str] | None,
+    followers: Collection[str],
 ) -> ColumnMap:
     array = arrays["position"].channel
     width = channels.arrays[array].shape[1]
@@ -143,12 +151,14 @@ def _from_arrays(
     names = [name.removesuffix(".pos") for name in own]
     by_order = not names
     if len(names) != width:
-        if names or joints is None or len(joints) != width:
+        leaders = [name for name in joints or () if name not in followers]
+        fits = leaders if len(leaders) == width else list(joints or ())
+        if names or len(fits) != width:
             model = (
                 "" if joints is None else f" (the model has {len(joints)}: {short(', '.join(joints), 80)})"
             )
             raise unguessed(channels, f"which joints the {width} columns of {array!r} are{model}")
-        names = list(joints)
+        names = fits
     found = match_joints(channels, names, joints)
     topic = array.rpartition(".")[0]
     command_time = None
@@ -162,14 +172,14 @@ def _from_arrays(
     unit = arrays["position"].unit or "rad"
     units = channels.units.get(array, ())
     units = units if len(units) == width and set(units) <= set(POSITION_UNITS) else (unit,) * width
-    fits = {role: guess.channel for role, guess in arrays.items()}
+    by_role = {role: guess.channel for role, guess in arrays.items()}
     return ColumnMap(
         time=time,
         command_time=command_time,
-        position=fits["position"],
-        target=fits.get("target"),
-        velocity=_of_same_rows(channels, fits, "velocity"),
-        effort=_of_same_rows(channels, fits, "effort"),
+        position=by_role["position"],
+        target=by_role.get("target"),
+        velocity=_of_same_rows(channels, by_role, "velocity"),
+        effort=_of_same_rows(channels, by_role, "effort"),
         joints=tuple(
             JointColumns(name=model, column=name, index=index if by_order else None, unit=units[index])
             for model, name, index in found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -129,11 +129,14 @@ def tables_of(
     tables = []
     for number, channels in enumerate(recordings):
         mapped = columns(channels) if callable(columns) else columns
-        used = mapped or _guess(channels, joints, say)
+        led = frozenset[str]() if kinds is None else kinds.followers
+        used = mapped or _guess(channels, joints, led, say)
         if kinds is not None:
             used = used.for_model(kinds)
         if say is not None:
-            _tell(say, channels, used, joints, mapped is None and number == 0, printed)
+            has = {joint.name for joint in used.joints}
+            asked = joints if joints is None else [name for name in joints if name not in led or name in has]
+            _tell(say, channels, used, asked, mapped is None and number == 0, printed)
         table = build_table(channels, used, joints)
         if unsaid := _unsaid(table, used):
             table.source["unsaid"] = unsaid
@@ -221,15 +224,18 @@ def is_episode(path: Path) -> bool:
     return False
 
 
-def _guess(channels: Channels, joints: Sequence[str] | None, say: Say | None) -> ColumnMap:
+def _guess(
+    channels: Channels, joints: Sequence[str] | None, led: Collection[str], say: Say | None
+) -> ColumnMap:
     topics = guess_topics(channels, joints)
     if topics is not None:
         return topics
     try:
-        return guess_columns(channels, joints)
+        return guess_columns(channels, joints, followers=led)
     except DatasetError:
         if say is not None:
-            _say_map(say, channels, joints, None)
+            asked = joints if joints is None else [name for name in joints if name not in led]
+            _say_map(say, channels, asked, None)
         raise
 
 

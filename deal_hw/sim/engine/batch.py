@@ -413,15 +413,16 @@ class ServoBatch:
         reference: FloatArray | None,
     ) -> None:
         """Put tangent coordinates, (M, G, C), of the members in ``rows`` into (M, G, nq) and (M, G, nv)."""
-        qpos[..., list(self.robot.qpos)] = self._true(position[..., self.robot.joints], rows)
         if self.robot.base is not None:
             at = self.robot.base[0]
             qpos[..., at : at + 3] = position[..., :3]
             orientation = to_quaternion(position[..., 3:6], IDENTITY if reference is None else reference)
             qpos[..., at + 3 : at + 7] = orientation
         qvel[..., self._dof] = velocity
+        speed = velocity[..., self.robot.joints]
         if self._scale is not None:
-            qvel[..., list(self.robot.qvel)] /= self._scale[rows][:, None]
+            speed = speed / self._scale[rows][:, None]
+        self.robot.place(qpos, self._true(position[..., self.robot.joints], rows), qvel, speed)
 
     def _roll(
         self,

@@ -23,10 +23,11 @@ def link_torques(
         acceleration: Joint accelerations, (T, J).
     """
     model, dofs = robot.model, list(robot.qvel)
-    data, place = mujoco.MjData(model), model.jnt_qposadr[model.dof_jntid[dofs]]
+    data = mujoco.MjData(model)
     found, torque = np.empty(position.shape), np.zeros(model.nv)
     for k in range(len(position)):
-        data.qpos[place], data.qvel[dofs], data.qacc[dofs] = position[k], velocity[k], acceleration[k]
+        robot.place(data.qpos, position[k], data.qvel, velocity[k])
+        data.qacc[dofs] = acceleration[k]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         # The recursion knows bodies only.

@@ -23,7 +23,7 @@ def point_positions(robot: RobotModel, body: str, point: Sequence[float], joints
     data = mujoco.MjData(robot.model)
     found = np.empty((len(joints), 3))
     for row, position in enumerate(joints):
-        data.qpos[list(robot.qpos)] = position
+        robot.place(data.qpos, position)
         mujoco.mj_kinematics(robot.model, data)
         place = data.body(body)
         found[row] = place.xpos + place.xmat.reshape(3, 3) @ np.asarray(point)

@@ -19,6 +19,7 @@ from deal_hw.sim.laws.commands import Filters
 from deal_hw.sim.parameters import apply_parameters, present
 from deal_hw.sim.parameters.drive import JointDrive, filtered, find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
+from deal_hw.sim.parameters.followers import Follower, followers_of
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 
@@ -40,6 +41,7 @@ class RobotModel:
         setups: The robot in other set-ups, such as with a payload, by their names.
         absent: Type and name of elements that other set-ups have, and this model lacks.
         own: Names of the set-ups whose own parameters act here.
+        followers: Joints that follow those of the description by an equality of the model.
     """
 
     description: RobotDescription
@@ -51,6 +53,7 @@ class RobotModel:
     setups: Mapping[str, RobotModel] = field(default_factory=dict)
     absent: frozenset[tuple[str, str]] = frozenset()
     own: frozenset[str] = frozenset()
+    followers: tuple[Follower, ...] = ()
 
     def in_setup(self, name: str) -> RobotModel:
         """Return the robot in a set-up; "" is the model itself."""
@@ -59,6 +62,27 @@ class RobotModel:
     def acting(self, space: ParameterSpace) -> ParameterSpace:
         """Return the parameters, those that act on this model with their elements, the others with none."""
         return present(space, self.absent, self.own)
+
+    def place(
+        self,
+        qpos: FloatArray,
+        position: FloatArray,
+        qvel: FloatArray | None = None,
+        velocity: FloatArray | None = None,
+    ) -> None:
+        """Write positions of the joints, (..., J), into (..., nq), with those of joints that follow them.
+
+        Args:
+            qpos: Where to write.
+            position: Positions of the joints [rad or m].
+            qvel: Where to write speeds, (..., nv); None: none are written.
+            velocity: Speeds of the joints, (..., J).
+        """
+        qpos[..., list(self.qpos)] = position
+        if qvel is not None:
+            qvel[..., list(self.qvel)] = velocity
+        for follower in self.followers:
+            follower.follow(self.model, qpos, qvel)
 
     @property
     def actuator_names(self) -> tuple[str, ...]:
@@ -149,6 +173,7 @@ def robot_model(description: RobotDescription, model: mujoco.MjModel) -> RobotMo
         qvel=tuple(int(model.jnt_dofadr[j]) for j in joints),
         actuator=tuple(actuator_of(model, name) for name in description.actuated),
         base=base,
+        followers=followers_of(model, joints),
     )
 
 

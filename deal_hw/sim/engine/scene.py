@@ -125,7 +125,7 @@ def body_poses(
     for t in np.flatnonzero(known):
         if base is not None and robot.base is not None:
             data.qpos[robot.base[0] : robot.base[0] + 7] = base[t]
-        data.qpos[list(robot.qpos)] = position[t]
+        robot.place(data.qpos, position[t])
         mujoco.mj_kinematics(model, data)
         where[t], turned[t] = data.xpos, data.xquat
     return where, turned

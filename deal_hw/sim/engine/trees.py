@@ -109,7 +109,7 @@ def _touching(robot: RobotModel, positions: FloatArray) -> set[tuple[int, int]]:
         return found
     data = mujoco.MjData(model)
     for position in positions:
-        data.qpos[list(robot.qpos)] = position
+        robot.place(data.qpos, position)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         trees = model.body_treeid[model.geom_bodyid[data.contact.geom]].reshape(-1, 2)

@@ -67,7 +67,7 @@ def on_floor(robot: RobotModel, feet: Sequence[str]) -> RobotModel:
 def _lowest(robot: RobotModel, feet: Sequence[str]) -> float:
     """Return the height of the feet's lowest point in the default pose [m], by their bounding boxes."""
     model, data = robot.model, mujoco.MjData(robot.model)
-    data.qpos[list(robot.qpos)] = robot.description.default_position
+    robot.place(data.qpos, np.array(robot.description.default_position))
     mujoco.mj_kinematics(model, data)
     found = []
     for foot in feet:

@@ -98,7 +98,7 @@ def leg_odometry(
     both, jacobian, dofs = np.empty(6), np.empty((3, model.nv)), list(robot.qvel)
     for t in range(T):
         data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = 0.0, orientation[t]
-        data.qpos[list(robot.qpos)] = joint_position[t]
+        robot.place(data.qpos, joint_position[t])
         data.qvel[dof : dof + 3], data.qvel[dof + 3 : dof + 6] = 0.0, angular_velocity[t]
         data.qvel[dofs] = joint_velocity[t]
         mujoco.mj_kinematics(model, data)

@@ -39,7 +39,7 @@ def standing_mass(
     borne = np.empty(len(position))
     for t in range(len(position)):
         data.qpos[at + 3 : at + 7] = orientation[t]
-        data.qpos[list(robot.qpos)] = position[t]
+        robot.place(data.qpos, position[t])
         mujoco.mj_forward(model, data)
         rows = []
         for foot in feet:

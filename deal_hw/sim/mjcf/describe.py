@@ -17,6 +17,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import actuator_of
 from deal_hw.sim.parameters.drive import JointDrive, drive_of
 from deal_hw.sim.parameters.fields import element_id, element_names
+from deal_hw.sim.parameters.followers import followers_of
 from deal_hw.sim.parameters.kind import HINGE, SLIDE, joint_of
 
 WINDOW_TICKS = 20
@@ -150,14 +151,15 @@ def with_speed_limits(description: RobotDescription, model: Any, space: Paramete
 
 
 def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
-    """Check that every joint was recorded; return the name of the base's free joint, if any."""
+    """Check that every joint was recorded or follows such; return the base's free joint, if any."""
     free: str | None = None
     missing = []
+    led = {follower.joint for follower in followers_of(model, recorded)}
     for index in range(model.njnt):
         name = model.joint(index).name
         if model.jnt_type[index] == _FREE and free is None and name:
             free = name
-        elif index not in recorded:
+        elif index not in recorded and index not in led:
             word = (
                 ""
                 if model.jnt_type[index] in (HINGE, SLIDE)

@@ -25,6 +25,7 @@ from deal_hw.sim.engine.model import RobotModel, model_with
 from deal_hw.sim.mjcf.bam import BAM, bam_parameters, drive_texts, parameter_texts
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
+from deal_hw.sim.parameters.followers import Follower
 from deal_hw.sim.parameters.inertia import INERTIA_KINDS
 from deal_hw.sim.parameters.laws import FREE_SPEED, LAW_KINDS
 from deal_hw.sim.parameters.transmission import TRANSMISSION_KINDS
@@ -236,6 +237,9 @@ def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
             row = _actuator(robot, model, result, description.actuated.index(joint))
             limit["effort"], damping = row["effort_limit"], row["joint_damping"]
         joints[joint] = {"dynamics": {"damping": damping, "friction": friction}, "limit": limit}
+    for follower in robot.followers:
+        if follower.leader >= 0 and not follower.coefficients[2:].any():
+            joints[model.joint(follower.joint).name] = {"mimic": _mimic(model, follower)}
     moved = [p for p in robot.acting(result.space).parameters if p.kind in _BODY_KINDS]
     bodies = dict.fromkeys(name for parameter in moved for name in parameter.elements)
     return {
@@ -245,6 +249,14 @@ def urdf_values(robot: RobotModel, result: CalibrationResult) -> dict[str, Any]:
         "without_value": list(result.without_value),
         "cannot_express": [*_URDF, *_left_out(result, (*_URDF_KINDS, *_BODY_KINDS))],
     }
+
+
+def _mimic(model: Any, follower: Follower) -> dict[str, Any]:
+    """Return a URDF's ``<mimic>`` of a joint, whose positions count from those of the model."""
+    constant, slope = map(float, follower.coefficients[:2])
+    own, led = (float(model.qpos0[model.jnt_qposadr[j]]) for j in (follower.joint, follower.leader))
+    leader = model.joint(follower.leader).name
+    return {"joint": leader, "multiplier": slope, "offset": own + constant - slope * led}
 
 
 def plain_values(result: CalibrationResult) -> dict[str, Any]:

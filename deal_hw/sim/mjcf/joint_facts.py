@@ -13,6 +13,7 @@ import numpy as np
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.parameters.drive import find_drive
+from deal_hw.sim.parameters.followers import natural_followers
 from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.types import FloatArray
 
@@ -38,6 +39,7 @@ class JointFacts:
             or what its gear or a scaled set-point makes of it.
         speed_gain: Effort an error of the speed of each joint whose actuator takes speeds, (J,)
             [N·m·s/rad or N·s/m]; NaN for others. Recordings hold efforts, this times the speed.
+        followers: Joints that need no reading, as an equality of the model moves them with others.
     """
 
     names: tuple[str, ...]
@@ -50,6 +52,7 @@ class JointFacts:
     full_effort: FloatArray
     gain: FloatArray
     speed_gain: FloatArray
+    followers: frozenset[str] = frozenset()
 
 
 def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
@@ -88,6 +91,7 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
         np.array(limits, dtype=np.float64),
         tuple(left_out),
         *_actuation(model, index_of),
+        frozenset(model.joint(follower.joint).name for follower in natural_followers(model)),
     )
 
 

@@ -11,6 +11,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.fields import element_names
+from deal_hw.sim.parameters.followers import natural_followers
 from deal_hw.sim.parameters.kind import Kind, joint_of
 
 DEFAULT_KINDS: Final = (
@@ -85,8 +86,10 @@ def usable_elements(model: Any, kind: Kind) -> Iterator[tuple[int, str, float]]:
 
     Elements without a name, which no parameter can name, and the world are none of them.
     """
+    # What a joint that follows another one does to the motion acts on that one, too.
+    led = {f.joint for f in natural_followers(model)} if kind.element == "joint" else set()
     for index, name in enumerate(element_names(model, kind.element)):
-        if not name or (kind.element == "body" and index == 0):
+        if not name or index in led or (kind.element == "body" and index == 0):
             continue
         try:
             if kind.usable is not None:

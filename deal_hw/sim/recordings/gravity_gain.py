@@ -62,7 +62,7 @@ def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGa
             rows = slice(first, first + length)
             mean = episode.position[rows].mean(axis=0)
             data.qpos[:], data.qvel[:] = model.qpos0, 0.0
-            data.qpos[list(robot.qpos)] = mean
+            robot.place(data.qpos, mean)
             mujoco.mj_forward(model, data)
             carried = data.qfrc_bias - data.qfrc_passive
             loads.append(carried[list(robot.qvel)][index] - offset)

@@ -30,7 +30,7 @@ def sensed_base(robot: RobotModel, trajectory: Trajectory) -> FloatArray | None:
     poses[:, 3:] = body.orientation
     for t, q in enumerate(trajectory.position):
         data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = 0.0, poses[t, 3:]
-        data.qpos[list(robot.qpos)] = q
+        robot.place(data.qpos, q)
         mujoco.mj_kinematics(robot.model, data)
         if feet:
             poses[t, 2] = np.max(robot.model.geom_size[feet, 0] - data.geom_xpos[feet, 2])

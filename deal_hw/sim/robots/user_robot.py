@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,6 +108,7 @@ def derive_robot(
     feet: Sequence[str] = (),
     several_trees: bool = False,
     mjcf_entry: str = "",
+    recorded: Collection[str] = (),
 ) -> UserRobot:
     """Return the robot that an MJCF describes.
 
@@ -119,6 +120,8 @@ def derive_robot(
         feet: Sphere geoms of the feet.
         several_trees: Whether driven joints in several trees are one robot, such as two arms.
         mjcf_entry: The model's path in robot.yaml; "" for its name alone.
+        recorded: Joints that are read although an equality of the model moves them with others; the robot
+            has these, too.
 
     Raises:
         ConfigurationError: It does not compile, has no known actuator, or has two robots.
@@ -128,13 +131,15 @@ def derive_robot(
     if not several_trees:
         _check_one_tree(mjcf, model)
     facts = joint_facts(mjcf, model)
+    read = [name for name in facts.names if name not in facts.followers or name in recorded]
     driven = [joint for joint, on in zip(facts.names, facts.servo | facts.motor, strict=True) if on]
     period_s = 1.0 / (state_rate_hz or control_rate_hz)
     rates = sampling(period_s, float(model.opt.timestep), period_s * WINDOW_TICKS)
-    base = describe(mjcf, model, facts.names, driven, rates)
+    base = describe(mjcf, model, read, driven, rates)
     servo = base.actuation == "position"
     joints = []
-    for j, joint in enumerate(facts.names):
+    for position, joint in zip(base.default_position, read, strict=True):
+        j = facts.names.index(joint)
         low, high = facts.limits[j]
         actuator = None
         if joint in driven:
@@ -152,7 +157,7 @@ def derive_robot(
             entry = JointEntry(
                 name=joint,
                 unit="m" if facts.units[j] == "m" else "rad",
-                default_position=float(np.clip(base.default_position[j], low, high)),
+                default_position=float(np.clip(position, low, high)),
                 position_range=(float(low), float(high)) if ranged else None,
                 actuator=actuator,
             )
@@ -180,7 +185,8 @@ def contradictions(robot: UserRobot) -> Iterator[str]:
     file, model = robot.file, robot.model
     facts = joint_facts(robot.mjcf, model)
     strange = [name for name in robot.joint_names if name not in facts.names]
-    absent = [name for name in facts.names if name not in robot.joint_names]
+    needed = [name for name in facts.names if name not in facts.followers]
+    absent = [name for name in needed if name not in robot.joint_names]
     if strange or absent:
         if strange:
             yield f"the MJCF has no joint {', '.join(strange)}; its joints are {', '.join(facts.names)}"

@@ -54,7 +54,7 @@ def read_tables(
 
 
 def kinds_of(facts: JointFacts) -> JointKinds:
-    """Return which joints of a model slide, and which have motors or velocity servos."""
+    """Return which joints of a model slide, have motors or velocity servos, or follow others."""
     from deal_hw.data.importing.columns import JointKinds
 
     speeds = {n: float(g) for n, g in zip(facts.names, facts.speed_gain, strict=True) if np.isfinite(g)}
@@ -63,6 +63,7 @@ def kinds_of(facts: JointFacts) -> JointKinds:
         slides=frozenset(n for n, unit in zip(facts.names, facts.units, strict=True) if unit == "m"),
         motors={name: float(full) for name, motor, full in motors if motor and name not in speeds},
         speeds=speeds,
+        followers=facts.followers,
     )
 
 
