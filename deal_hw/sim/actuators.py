@@ -30,6 +30,7 @@ from deal_hw.sim.mjcf.plain import PLAIN_TEXT
 from deal_hw.sim.parameters import DEVICE_KINDS, KIND_TABLE
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
+from deal_hw.sim.parameters.one_drive import gather
 from deal_hw.sim.parameters.sensor import ENCODER_BIAS, ENCODER_SCALE
 from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
 from deal_hw.sim.parameters.values import spread
@@ -67,6 +68,7 @@ class ActuatorLaws:
             if found
         }
         actuators, joints = element_names(model, "actuator"), element_names(model, "joint")
+        gather(model)
 
         def of(kind: str, names: list[str], neutral: float) -> FloatArray:
             found = spread(values, kind, names, neutral, 1)

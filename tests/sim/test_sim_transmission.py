@@ -463,7 +463,7 @@ RUBS = ("friction_at_motor", "shoulder", 1.0)
             r"armature of its own; write it as",
         ),
         (
-            SERVO.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-3 3"'),
+            SERVO.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-3 3" actuatorgravcomp="true"'),
             space(STIFF),
             r"as forcerange",
         ),

@@ -127,3 +127,24 @@ def test_green_is_not_said_where_held_out_motion_does_more(model: Path) -> None:
     assert found.colour != "green"
     (alarm,) = found.result.alarms
     assert "On held-out motion the error is" in alarm.seen and "--data" in alarm.do
+
+
+def test_a_joint_limit_of_a_motor_is_searched_where_commands_reach_it(tmp_path: Path) -> None:
+    """By efforts at the joint: 0.9 N·m of commands do not reach 1 N·m of actuatorfrcrange, 1.2 N·m do."""
+    text = SERVO.format(**TRUE).replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-1 1"')
+    start, _, end = text.partition("<position")
+    model = tmp_path / "motor.xml"
+    model.write_text(f'{start}<motor name="drive" joint="hub" gear="3"/>{end.partition("/>")[2]}')
+    signs = np.random.default_rng(1).choice([-1, 0, 1], 40)
+    for most, found in ((0.9, False), (1.2, True)):
+        compiled = mujoco.MjModel.from_xml_path(str(model))
+        data, rows = mujoco.MjData(compiled), []
+        for k in range(400):
+            effort = most * signs[k // 10]
+            rows.append((0.01 * k, data.qpos[0], effort))
+            data.ctrl[0] = effort / 3
+            mujoco.mj_step(compiled, data, 5)
+        columns = dict(zip(("time", "hub_pos", "hub_cmd"), np.array(rows).T, strict=True))
+        columns["hub_pos"] = columns["hub_pos"] + 5e-4 * np.random.default_rng(0).standard_normal(400)
+        work = calibration_input(FilesSettings(model, columns, force=True))
+        assert ("drive.servo_effort_limit" in work.space.names) == found

@@ -22,6 +22,7 @@ import numpy as np
 from deal_hw.child_process import signal_at_end_of_parent
 from deal_hw.errors import ConfigurationError, short
 from deal_hw.reading import MIB, check_size, reading
+from deal_hw.sim.parameters.one_drive import gather
 
 MJCF_BYTES: Final = 64 * MIB
 """Largest main file of a model; included files count as memory."""
@@ -108,15 +109,17 @@ def _real(folder: str) -> str:
 
 
 def _compiled(path: Path) -> mujoco.MjModel:
-    """Compile in this process.
+    """Compile in this process, with one drive a joint (:mod:`deal_hw.sim.parameters.one_drive`).
 
     Raises:
         ConfigurationError: It does not compile.
     """
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as err:
         raise ConfigurationError(f"model {path} does not compile: {short(str(err))}") from err
+    gather(model)
+    return model
 
 
 def _try(path: Path) -> list[str]:

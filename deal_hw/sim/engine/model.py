@@ -21,6 +21,7 @@ from deal_hw.sim.parameters.drive import JointDrive, filtered, find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
 from deal_hw.sim.parameters.followers import Follower, followers_of
 from deal_hw.sim.parameters.kind import joint_of
+from deal_hw.sim.parameters.one_drive import brakes, gather
 from deal_hw.types import FloatArray
 
 BASE_COORDINATES = ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz")
@@ -157,10 +158,13 @@ def load_model(description: RobotDescription, step_s: float | None = None) -> Ro
 def robot_model(description: RobotDescription, model: mujoco.MjModel) -> RobotModel:
     """Return a compiled model with the indices of a robot's joints, actuators and base, found by name.
 
+    Its drives are gathered in place (:mod:`deal_hw.sim.parameters.one_drive`).
+
     Raises:
         ConfigurationError: No actuator drives an actuated joint, or several do.
         UnknownNameError: A joint of the description is not in the model.
     """
+    gather(model)
     joints = [element_id(model, "joint", name) for name in description.joint_names]
     base = None
     if description.floating_base is not None:
@@ -185,7 +189,8 @@ def actuator_of(model: mujoco.MjModel, joint: str) -> int:
         ConfigurationError: No actuator drives it, or several do.
     """
     index = element_id(model, "joint", joint)
-    found = [i for i in range(model.nu) if joint_of(model, i) == index]
+    idle = brakes(model)
+    found = [i for i in range(model.nu) if joint_of(model, i) == index and i not in idle]
     if len(found) == 1:
         return found[0]
     names = element_names(model, "actuator")
@@ -196,7 +201,9 @@ def actuator_of(model: mujoco.MjModel, joint: str) -> int:
         )
     raise ConfigurationError(
         f"actuators {', '.join(names[i] or f'number {i}' for i in found)} all drive joint {joint!r}; "
-        "keep the one that takes the recorded commands"
+        "keep the one that takes the recorded commands. A <position> and a <velocity> are one drive if "
+        "neither has a forcerange, a filter or a delay of its own: write the limit as actuatorfrcrange of "
+        "the joint"
     )
 
 

@@ -23,6 +23,7 @@ from deal_hw.sim.mjcf.text import Element, SourceFile, read_files
 from deal_hw.sim.parameters import DEVICE_KINDS, check_kinds
 from deal_hw.sim.parameters.drive import filtered
 from deal_hw.sim.parameters.fields import element_id
+from deal_hw.sim.parameters.one_drive import scatter
 from deal_hw.types import FloatArray
 
 SPEED_LIMIT_NUMERIC = "deal_hw.speed_limit"
@@ -87,6 +88,7 @@ def write_calibrated_mjcf(
     ]
     model = model_with(robot, space, theta)
     lags = _write_lags(model, space, theta)
+    scatter(model, mujoco.MjModel.from_xml_path(os.path.abspath(robot.description.mjcf)))
     return change_mjcf(
         robot.description.mjcf,
         path,

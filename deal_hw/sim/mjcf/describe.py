@@ -19,6 +19,7 @@ from deal_hw.sim.parameters.drive import JointDrive, drive_of
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.followers import followers_of
 from deal_hw.sim.parameters.kind import HINGE, SLIDE, joint_of
+from deal_hw.sim.parameters.one_drive import brakes
 
 WINDOW_TICKS = 20
 """Control periods in a search's longest window, whose length is ``--window``."""
@@ -129,7 +130,8 @@ def describe(
             "joint_names": "the recording's column map",
             "stiffness": "gain of the MJCF's position actuators, at the joint",
             "damping": "velocity term of the same actuators, at the joint",
-            "effort_limit": "forcerange of the same actuators, at the joint; infinite where there is none",
+            "effort_limit": "the same actuators' forcerange at the joint, or the joint's actuatorfrcrange; "
+            "infinite where there is none",
             "state_rate_hz": "the recording's own stamps",
             "device_rate_hz": "the physics step: the MJCF's timestep fitted into the sampling period",
             "control_rate_hz": "unit of window lengths: the sampling rate over a whole number",
@@ -175,7 +177,8 @@ def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
 
 
 def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[str]) -> None:
-    idle = [model.actuator(i).name or f"number {i}" for i in range(model.nu) if i not in actuators]
+    used = {*actuators, *brakes(model)}
+    idle = [model.actuator(i).name or f"number {i}" for i in range(model.nu) if i not in used]
     apart = [
         f"{model.actuator(i).name or f'number {i}'} (a {DRIVEN.get(int(model.actuator_trntype[i]), 'body')})"
         for i in range(model.nu)

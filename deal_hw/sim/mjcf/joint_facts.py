@@ -15,6 +15,7 @@ from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.followers import natural_followers
 from deal_hw.sim.parameters.kind import joint_of
+from deal_hw.sim.parameters.one_drive import brakes
 from deal_hw.types import FloatArray
 
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
@@ -102,9 +103,10 @@ def _actuation(
     servo, motor = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
     command, full_effort = np.tile([-np.inf, np.inf], (len(column), 1)), np.full(len(column), np.nan)
     gain, speed_gain = np.ones(len(column)), np.full(len(column), np.nan)
+    idle = brakes(model)
     for actuator in range(model.nu):
         joint = joint_of(model, actuator)
-        if joint not in column:
+        if joint not in column or actuator in idle:
             continue
         at, drive = column[joint], find_drive(model, actuator)
         closes = drive is not None and drive.takes == "position"

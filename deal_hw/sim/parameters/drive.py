@@ -20,6 +20,7 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.parameters.kind import joint_of
+from deal_hw.sim.parameters.one_drive import brakes
 from deal_hw.types import FloatArray
 
 Takes = Literal["position", "velocity", "effort"]
@@ -147,6 +148,8 @@ def filtered(model: Any, actuator: int) -> bool:
 
 def _problem(model: Any, actuator: int, effort: float, bias: FloatArray) -> str:
     """Return what an actuator is instead of a drive that is known, and what to write; "" for nothing."""
+    if actuator in brakes(model):
+        return "is the damping of the position servo beside it; search that one's servo_damping"
     dynamics = int(model.actuator_dyntype[actuator])
     if dynamics not in (_NO_FILTER, _FILTER, _EXACT):
         return _INSTEAD.get(dynamics, f"has dyntype number {dynamics}; write a <position> or a <motor>")

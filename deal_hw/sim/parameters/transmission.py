@@ -18,6 +18,7 @@ from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.fields import element_id
 from deal_hw.sim.parameters.kind import Kind, joint_of, one_dof_joint
 from deal_hw.sim.parameters.laws import FRICTION_KINDS, check_integrator
+from deal_hw.sim.parameters.one_drive import brakes
 
 TRANSMISSION_STIFFNESS: Final = "transmission_stiffness"
 TRANSMISSION_DAMPING: Final = "transmission_damping"
@@ -41,10 +42,11 @@ def _elastic(model: Any, actuator: int, name: str) -> None:
         )
     if model.jnt_actfrclimited[joint]:
         raise ConfigurationError(
-            f"joint {own!r} limits the actuator's force (actuatorfrcrange), which here is the motor's limit; "
+            f"joint {own!r} limits the effort of several actuators, or of one that carries gravity beside "
+            "(actuatorfrcrange, actuatorgravcomp), and a transmission has one motor with a limit of its own; "
             f"write it as forcerange of the actuator {name!r}"
         )
-    drives = [a for a in range(model.nu) if joint_of(model, a) == joint]
+    drives = [a for a in range(model.nu) if joint_of(model, a) == joint and a not in brakes(model)]
     if len(drives) > 1:
         names = ", ".join(repr(model.actuator(a).name) for a in drives)
         raise ConfigurationError(

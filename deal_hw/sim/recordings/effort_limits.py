@@ -16,9 +16,14 @@ AT_LIMIT = 0.01
 def drives_at_limit(robot: RobotModel, episodes: Iterable[SampledEpisode]) -> tuple[str, ...]:
     """Return the actuators that often ask for more than their effort limit, by the model's gains."""
     joints = list(robot.description.actuated_index)
+    drives = [(0.0, np.inf) if d is None else (abs(d.gain), d.effort_limit) for d in robot.drives]
+    gain, limit = np.array(drives).reshape(-1, 2).T
     asks = []
     for e in episodes:
         rows = np.minimum(e.sample, len(e.target) - 1)
+        if robot.description.actuation == "motor":
+            asks.append(gain * np.abs(e.target[rows]) > limit)
+            continue
         error = np.abs(e.target[rows] - e.position[:, robot.joints][:, joints])
         asks.append(e.stiffness[rows] * error > e.effort_limit[rows])
     share = np.mean(np.concatenate(asks), axis=0)

@@ -27,6 +27,7 @@ from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, actuator_of
 from deal_hw.sim.parameters import KIND_TABLE, check_space
 from deal_hw.sim.parameters.fields import ELEMENTS, element_id, element_names, unknown_name
+from deal_hw.sim.parameters.one_drive import gather
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.own_setups import OWN, recording_of
 
@@ -245,6 +246,7 @@ class Setups:
             ball.mass, ball.explicitinertial = mass, True
             ball.ipos, ball.inertia = [0, 0, 0], [0.4 * mass * payload.radius**2] * 3
         model = spec.compile()
+        gather(model)
         model.opt.timestep = robot.step_s
         return model
 

@@ -31,6 +31,7 @@ from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.engine.model import RobotModel, drop_filters, model_with
 from deal_hw.sim.parameters import KINDS
 from deal_hw.sim.parameters.fields import BatchFields
+from deal_hw.sim.parameters.one_drive import gather
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import Windows, setpoints
 from deal_hw.types import FloatArray
@@ -218,6 +219,7 @@ class _Bridge:
         self.slewed = any(p.kind == SPEED_LIMIT for p in self.space.free)
         self._spec = self._with_sensors()
         self._nominal = self._spec.compile()
+        gather(self._nominal)
         self._batch = ServoBatch(self.robot, self.space, 1, threads=1)
         measured = np.concatenate([self._measured(r).reshape(-1, len(self._joints)) for r in self.recordings])
         size = np.sqrt(np.nanmean(measured**2, axis=0))
