@@ -302,8 +302,8 @@ def test_fields_without_an_attribute_are_refused_and_nothing_is_left(tmp_path: P
     assert not (tmp_path / "c.xml").exists()
 
 
-def test_elements_that_a_macro_makes_are_refused(tmp_path: Path) -> None:
-    """A body inside <replicate> stands once in the text and many times in the model."""
+def test_elements_that_a_macro_makes_are_written_out(tmp_path: Path) -> None:
+    """A body inside <replicate> stands once in the text and many times in the model: each gets a text."""
     path = tmp_path / "many.xml"
     path.write_text(
         '<mujoco><worldbody><replicate count="3" offset="1 0 0"><body name="b"><joint name="j"/>'
@@ -313,8 +313,47 @@ def test_elements_that_a_macro_makes_are_refused(tmp_path: Path) -> None:
     def change(model: Any) -> None:
         model.dof_damping[1] = 0.3
 
-    with pytest.raises(ConfigurationError, match=r"joint 'j1' must change.*<replicate>"):
-        write(path, tmp_path / "c.xml", change)
+    assert write(path, tmp_path / "c.xml", change).dof_damping.tolist() == [0.0, 0.3, 0.0]
+    text = (tmp_path / "c.xml").read_text()
+    assert "written out in full" in text and text.count("<joint") == 3
+    assert {file.name for file in tmp_path.iterdir()} == {"many.xml", "c.xml"}
+
+
+def test_attached_models_are_written_out(tmp_path: Path) -> None:
+    """Two arms of one file, with meshes beside it, in frames: found from the folder of the new file.
+
+    Numbers have the six digits that MuJoCo writes; those that change have all of theirs.
+    """
+    (tmp_path / "parts" / "meshes").mkdir(parents=True)
+    (tmp_path / "parts" / "meshes" / "link.obj").write_text(tetrahedron(0.2))
+    (tmp_path / "parts" / "arm.xml").write_text(
+        '<mujoco><compiler meshdir="meshes"/><default><joint damping="0.1234567891"/></default>'
+        '<asset><mesh name="link" file="link.obj"/></asset>'
+        '<worldbody><body name="link"><joint name="hub"/><geom type="mesh" mesh="link"/></body></worldbody>'
+        '<actuator><position name="hub" joint="hub" kp="3"/></actuator></mujoco>'
+    )
+    path = tmp_path / "cell.xml"
+    arms = "".join(
+        f'<frame pos="{x} 0 0" euler="0 0 33"><attach model="arm" body="link" prefix="{side}_"/></frame>'
+        for side, x in (("l", 0.123456789), ("r", -1))
+    )
+    path.write_text(
+        '<mujoco><asset><model name="arm" file="parts/arm.xml"/></asset>'
+        f'<worldbody>{arms}<camera pos="0.123456789 0 0"/></worldbody></mujoco>'
+    )
+
+    def change(model: Any) -> None:
+        model.joint("r_hub").damping[0] = 0.23456789123
+        model.body("l_link").mass[0] *= 1.1
+        model.body("l_link").inertia[:] *= 1.1
+        model.actuator("l_hub").gainprm[0], model.actuator("l_hub").biasprm[1] = 4.5, -4.5
+
+    (tmp_path / "out").mkdir()
+    model = write(path, tmp_path / "out" / "c.xml", change)
+    assert model.joint("r_hub").damping[0] == 0.23456789123
+    assert model.joint("l_hub").damping[0] == pytest.approx(0.1234567891, rel=5e-6)
+    assert model.actuator("l_hub").gainprm[0] == 4.5
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["c.xml"]
 
 
 def test_file_that_is_not_well_formed_says_where(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Only attributes with a changed value are edited; see :mod:`deal_hw.sim.mjcf.text
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ from deal_hw.errors import ConfigurationError, short
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel, model_with
 from deal_hw.sim.mjcf import tables
-from deal_hw.sim.mjcf.changes import MjcfChanges, differences, numbers
+from deal_hw.sim.mjcf.changes import SAME, MjcfChanges, NotInTextError, differences, numbers
+from deal_hw.sim.mjcf.flat import ROUNDED, write_flat
 from deal_hw.sim.mjcf.paths import Relocation
 from deal_hw.sim.mjcf.text import Element, SourceFile, read_files
 from deal_hw.sim.parameters import DEVICE_KINDS, check_kinds
@@ -36,7 +38,7 @@ ROUNDS = 4
 """Most rounds of writing. Writing one value may disable another one of the compiler (``dampratio``,
 ``settotalmass``); the next round writes the resulting difference."""
 
-_CHECK = 1e-9
+_CHECK, _CHECK_ZERO = 1e-9, 1e-12
 _CHECK_DERIVED = 1e-5
 
 
@@ -204,25 +206,59 @@ def change_mjcf(
         ConfigurationError: As :func:`write_calibrated_mjcf`.
     """
     require_other(target, path)
+
+    def write(file: Path, rounded: float, *more: str) -> tuple[Path, ...]:
+        return _write(file, target, want, custom, texts or {}, (path.name, source, *more, *remarks), rounded)
+
+    try:
+        return write(path, SAME)
+    except NotInTextError:
+        # Beside the target, as both name meshes and textures from there.
+        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".flat-", suffix=".xml") as waiting:
+            flat = Path(waiting.name)
+            write_flat(path, flat)
+            return write(flat, ROUNDED, "written out in full, as other models or macros made it")
+
+
+def _write(
+    path: Path,
+    target: Path,
+    want: Any,
+    custom: Mapping[str, tuple[Sequence[float], Sequence[str]]],
+    texts: Mapping[str, str],
+    words: Sequence[str],
+    rounded: float,
+) -> tuple[Path, ...]:
+    """Write a file's text with changes; see :func:`change_mjcf`.
+
+    Args:
+        path: The file.
+        target: The file to write.
+        want: The wanted model.
+        custom: Numbers for ``<custom>``.
+        texts: Texts for ``<custom>``.
+        words: Name of the user's file, source of the values, and more lines for the comment at the top.
+        rounded: Relative error of the file's numbers.
+    """
     top = read_files(path)
     spec = mujoco.MjSpec.from_file(str(top.path))
     have = spec.compile()
-    changes = MjcfChanges(top.root, have, bool(spec.compiler.degree))
+    changes = MjcfChanges(top.root, have, bool(spec.compiler.degree), rounded)
     relocation = Relocation(top, target)
     relocation.adapt()
-    _set_custom(top.root, custom, texts or {})
+    _set_custom(top.root, custom, texts)
     written: dict[Path, SourceFile] = {}
     try:
         for _ in range(ROUNDS):
             open_ = changes.apply(have, want)
-            top.header = _header(path, changes, custom, source, remarks)
+            top.header = _header(changes, custom, *words)
             written = relocation.files()
             for file, content in written.items():
                 file.write_bytes(content.render())
             if not open_:
                 break
             have = compiled(target)
-        _check(target, have, want)
+        _check(target, have, want, rounded)
     except (ConfigurationError, OSError):
         for file in written:
             file.unlink(missing_ok=True)
@@ -256,31 +292,27 @@ def compiled(path: Path) -> Any:
         ) from err
 
 
-def _check(path: Path, written: Any, want: Any) -> None:
-    wrong = differences(written, want, _CHECK)
-    # Values near zero after a rotation or a scaling are rounding errors.
-    wrong = {
-        k: v
-        for k, v in wrong.items()
-        if not np.allclose(getattr(written, k), getattr(want, k), _CHECK, 1e-12)
-    }
+def _check(path: Path, written: Any, want: Any, rounded: float) -> None:
+    # A file of rounded numbers is as near as these are.
+    wrong = differences(written, want, max(_CHECK, rounded), max(_CHECK_ZERO, rounded))
+    derived = max(_CHECK_DERIVED, 10 * rounded)
     for name in tables.FOLLOWS:
         have, wish = getattr(written, name), getattr(want, name)
-        if not np.allclose(have, wish, rtol=_CHECK_DERIVED, atol=1e-9):
-            wrong[name] = ~np.isclose(have, wish, rtol=_CHECK_DERIVED, atol=1e-9)
+        if not np.allclose(have, wish, rtol=derived, atol=1e-9):
+            wrong[name] = ~np.isclose(have, wish, rtol=derived, atol=1e-9)
     for name, mask in wrong.items():
         have, wish = getattr(written, name)[mask], getattr(want, name)[mask]
         raise ConfigurationError(f"{path}: {name} came out as {have.tolist()}, expected {wish.tolist()}")
 
 
 def _header(
-    path: Path,
     changes: MjcfChanges,
     custom: Mapping[str, tuple[Sequence[float], Sequence[str]]],
+    name: str,
     source: str,
-    remarks: Sequence[str],
+    *remarks: str,
 ) -> str:
-    lines = [f"Calibrated by deal-hw{': ' + source if source else ''}. A change of {path.name}:"]
+    lines = [f"Calibrated by deal-hw{': ' + source if source else ''}. A change of {name}:"]
     for (_, element, attribute), (old, new) in changes.log.items():
         lines.append(f"  {element}: {attribute} {_short(old)} -> {_short(new)}")
     for name, (data, elements) in custom.items():

@@ -44,8 +44,14 @@ def arrays(model: Any) -> Iterator[tuple[str, Any]]:
                 yield name, value
 
 
-def differences(have: Any, want: Any, tolerance: float = SAME) -> dict[str, Mask]:
+def differences(have: Any, want: Any, tolerance: float = SAME, zero: float = 0.0) -> dict[str, Mask]:
     """Return where two compiled models differ, by field, without fields that MuJoCo derives from others.
+
+    Args:
+        have: One model.
+        want: The other one.
+        tolerance: Relative difference up to which values are the same.
+        zero: Difference up to which they are: values near zero after a rotation are rounding errors.
 
     Raises:
         ConfigurationError: The models have different elements.
@@ -60,7 +66,7 @@ def differences(have: Any, want: Any, tolerance: float = SAME) -> dict[str, Mask
                 f"the calibrated model has other elements than the file: {name} has shape {other.shape}, in "
                 f"the file {value.shape}"
             )
-        mask = ~np.isclose(value, other, rtol=tolerance, atol=0.0, equal_nan=True)
+        mask = ~np.isclose(value, other, rtol=tolerance, atol=zero, equal_nan=True)
         if mask.any():
             found[name] = mask
     return found
@@ -77,6 +83,10 @@ def numbers(values: Iterable[float]) -> str:
     return " ".join(number(v) for v in values)
 
 
+class NotInTextError(ConfigurationError):
+    """An element that must change has no text of its own in the file."""
+
+
 class MjcfChanges:
     """Writes differences of compiled models into the elements of a file.
 
@@ -84,10 +94,12 @@ class MjcfChanges:
         root: Root element of the main file, included files spliced in.
         model: The compiled file: it names the elements.
         degrees: The compiler reads angles in degrees.
+        rounded: Relative error of the file's numbers: smaller differences are not written.
     """
 
-    def __init__(self, root: Element, model: Any, degrees: bool) -> None:
+    def __init__(self, root: Element, model: Any, degrees: bool, rounded: float = SAME) -> None:
         self.root = root
+        self._rounded = rounded
         self.degrees = degrees
         self.log: dict[tuple[str, str, str], tuple[str, str]] = {}
         self._elements = _index(root, model)
@@ -103,7 +115,7 @@ class MjcfChanges:
         Raises:
             ConfigurationError: A field differs that no attribute holds, or an element cannot be found.
         """
-        masks = differences(have, want)
+        masks = differences(have, want, self._rounded, self._rounded if self._rounded > SAME else 0.0)
         options = self._options(have.opt, want.opt)
         written: set[str] = set()
         for kind, attributes in tables.TABLES.items():
@@ -127,11 +139,11 @@ class MjcfChanges:
         """Return the element of a compiled object.
 
         Raises:
-            ConfigurationError: It is not in the file's text.
+            NotInTextError: It is not in the file's text.
         """
         element = self._elements[kind][index]
         if element is None:
-            raise ConfigurationError(
+            raise NotInTextError(
                 f"{self._name(kind, index)} must change, but it is not in the MJCF's text (it has no name, "
                 "or <replicate>, <composite> or <attach> makes it): give it a name or write it out"
             )
