@@ -25,7 +25,7 @@ from deal_hw.calib.data.noise import (
     smooth_states,
     white_noise_std,
 )
-from deal_hw.calibration import LATENCY_RANGE_S
+from deal_hw.calibration import LATENCY, LATENCY_RANGE_S
 from deal_hw.description import EFFORT_UNITS
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
@@ -45,6 +45,8 @@ from deal_hw.types import FloatArray, IntArray
 Member = tuple[FloatArray, float]
 """Physical parameters, (K,), and latency [s]."""
 
+LATENCY_ROOM = 2.0
+"""Least end of a range of the latency that nobody chose, over the latency that the model has."""
 NOISE_FREE_RESIDUAL = 1e-5
 """Residual scale of noise-free recordings [m or rad]: far above rounding, far below sensors."""
 
@@ -246,6 +248,8 @@ class Problem:
                 f"latency {' to '.join(f'{1e3 * v:g}' for v in given or (low, high))} ms: a range is two "
                 f"different values, the lower one first; no robot is later than {1e3 * longest:g} ms"
             )
+        if LATENCY in self.guessed:
+            high = min(max(high, LATENCY_ROOM * robot.latency_s), longest)
         if not episodes:
             raise InsufficientDataError("no recording was given; record one with `deal-hw collect`")
         states = episodes[0].channels
@@ -412,8 +416,10 @@ class Problem:
 
     @property
     def first_latency_s(self) -> float:
-        """Latency at which fits begin: the given one, else the lowest in the range [s]."""
-        return self.latency_range_s[0] if self.fixed_latency_s is None else self.fixed_latency_s
+        """Latency at which fits begin: the given one, else the model's, or the range's end next to it [s]."""
+        if self.fixed_latency_s is not None:
+            return self.fixed_latency_s
+        return float(np.clip(self.robot.latency_s, *self.latency_range_s))
 
     @property
     def noise_free(self) -> bool:

@@ -150,8 +150,8 @@ def gather(
     # A recording that was cut into stretches is shown as one.
     fitted, held = joined(episodes), joined(holdout)
     theta = np.stack([result.space.nominal, result.estimate])
-    # The user's own model has no latency: the same candidates as in the held-out error.
-    latency_s = np.array([0.0, result.latency_s])
+    # The same candidates as in the held-out error.
+    latency_s = np.array([robot.latency_s, result.latency_s])
     parts = Counter(e.name for e in (*fitted, *held))
     for group, heldout in ((held, True), (fitted, False)):
         word = "held-out" if heldout else "fitted"

@@ -149,7 +149,8 @@ def print_result(result: CalibrationResult, advice: str, name: str = "") -> None
     low_ms, high_ms = (1e3 * v for v in result.latency_interval_s)
     latency = (f"{1e3 * result.latency_s:.2f}", f"{low_ms:.2f} .. {high_ms:.2f}")
     bias = f"biased by {result.biased['latency']}" if "latency" in result.biased else ""
-    table.add_row(Text("latency [ms]"), "0", *latency, bias)
+    own_ms = 1e3 * result.provenance.get("model_latency_s", 0.0)
+    table.add_row(Text("latency [ms]"), f"{own_ms:.4g}", *latency, bias)
     console = Console()
     # A row of long names is broken by the terminal, which is easier to read than cells that are broken.
     Console(width=max(console.width, TABLE_WIDTH)).print(table)

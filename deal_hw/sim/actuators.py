@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.batch import COMMAND_DELAY, command_laws
-from deal_hw.sim.engine.model import command_scale, drop_filters, filters_of
+from deal_hw.sim.engine.model import command_scale, drop_command_laws, filters_of
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.transmission import take_constant_torques
 from deal_hw.sim.laws.setpoints import delay, slew
@@ -82,7 +82,7 @@ class ActuatorLaws:
         self._servo = np.array([d is not None and d.takes == "position" for d in drives], dtype=bool)
         self._per_ctrl = command_scale(model, range(model.nu))
         filters = filters_of(model, range(model.nu), self._per_ctrl)
-        drop_filters(model)
+        drop_command_laws(model)
         self._rate = of("servo_speed_limit", actuators, np.inf) * model.opt.timestep
         late_s = of(COMMAND_DELAY, actuators, 0.0) + custom_latency_s(model)
         self._lag = late_s[None] / model.opt.timestep

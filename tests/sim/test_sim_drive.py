@@ -165,7 +165,6 @@ REFUSED = {
     "biastype='affine' biasprm='0 0 .5'": r"biasprm\[2\] is 0.5",
     "gear='0'": "its gear or gain is 0",
     "dyntype='filter' dynprm='.1' actrange='-1 1'": "actrange.*write ctrlrange",
-    "delay='.01' nsample='4'": "calibration finds the latency",
 }
 
 

@@ -22,7 +22,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.effort import TORQUE, EffortSensors, effort_joints
 from deal_hw.sim.engine.engines import Engine, MujocoEngine, State
 from deal_hw.sim.engine.gpu import EngineName
-from deal_hw.sim.engine.model import RobotModel, drop_filters
+from deal_hw.sim.engine.model import RobotModel, drop_command_laws
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.engine.transmission import check_engine, take_constant_torques
@@ -141,10 +141,10 @@ class ServoBatch:
         self.effort_joints = effort_joints(robot.description, space)
         self.count = count
         self._filters, model = robot.filters, robot.model
-        if self._filters is not None:
+        if self._filters is not None or model.actuator_delay.any():
             # Windows begin with positions and velocities: the filters' states follow from the commands.
             model = copy.copy(model)
-            drop_filters(model)
+            drop_command_laws(model)
         sprung = [e for p in self._here.parameters if p.kind == TRANSMISSION_STIFFNESS for e in p.elements]
         if sprung:
             check_engine(space, engine)
@@ -198,6 +198,10 @@ class ServoBatch:
         self._bias = np.zeros((count, len(joints))) if bias is None else bias
         self._scale = spread(values, ENCODER_SCALE, joints, 1.0, count)
         self._delay_s = spread(values, COMMAND_DELAY, actuators, 0.0, count)
+        if (own := self.robot.command_delay_s).any():
+            searched = np.isin(actuators, [name for name, _ in values.get(COMMAND_DELAY, ())])
+            self._delay_s = np.where(searched, 0.0 if self._delay_s is None else self._delay_s, own)
+            self._delay_s = np.broadcast_to(self._delay_s, (count, len(actuators)))
         self.commands = command_laws(values, actuators, count, self._filters)
         self._steps = StepLaws.of(self._fields, self.engine.bind, values)
         self._efforts: EffortSensors | None = None

@@ -104,6 +104,16 @@ class RobotModel:
         return filters_of(self.model, self.actuator, self.command_scale)
 
     @property
+    def latency_s(self) -> float:
+        """Latency of the MJCF, the least delay of its actuators [s]: where a search of the latency begins."""
+        return float(min(self.model.actuator_delay[list(self.actuator)], default=0.0))
+
+    @property
+    def command_delay_s(self) -> FloatArray:
+        """Delay of each actuator's commands in the MJCF beyond that latency, (A,) [s]."""
+        return np.asarray(self.model.actuator_delay[list(self.actuator)] - self.latency_s)
+
+    @property
     def command_scale(self) -> FloatArray:
         """A command of each actuator, set-point of the joint or ``ctrl`` of a motor, over ``ctrl``, (A,)."""
         return command_scale(self.model, self.actuator)
@@ -235,8 +245,9 @@ def filters_of(model: mujoco.MjModel, actuators: Sequence[int], scale: FloatArra
     )
 
 
-def drop_filters(model: mujoco.MjModel) -> None:
-    """Remove the filters of a model's actuators, for an engine whose commands pass laws before."""
+def drop_command_laws(model: mujoco.MjModel) -> None:
+    """Remove filters and delays of a model's actuators, for an engine whose commands pass laws before."""
+    model.actuator_delay[:] = 0.0
     for actuator in range(model.nu):
         if filtered(model, actuator):
             model.actuator_dyntype[actuator] = int(mujoco.mjtDyn.mjDYN_NONE)

@@ -16,6 +16,7 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError, short
 from deal_hw.parameters import ParameterSpace
+from deal_hw.sim.engine.batch import COMMAND_DELAY
 from deal_hw.sim.engine.model import RobotModel, model_with
 from deal_hw.sim.mjcf import tables
 from deal_hw.sim.mjcf.changes import SAME, MjcfChanges, NotInTextError, differences, numbers
@@ -90,12 +91,13 @@ def write_calibrated_mjcf(
     ]
     model = model_with(robot, space, theta)
     lags = _write_lags(model, space, theta)
+    model.actuator_delay[:] = 0.0
     scatter(model, mujoco.MjModel.from_xml_path(os.path.abspath(robot.description.mjcf)))
     return change_mjcf(
         robot.description.mjcf,
         path,
         model,
-        device_values(space, theta, lags) | {LATENCY_NUMERIC: ([latency_s], [])},
+        _with_own_delays(robot, device_values(space, theta, lags)) | {LATENCY_NUMERIC: ([latency_s], [])},
         source,
         # A file that was calibrated before may have a list: it is replaced, also by "none".
         {
@@ -122,6 +124,17 @@ def _write_lags(model: Any, space: ParameterSpace, theta: FloatArray) -> set[str
                 model.actuator_dynprm[actuator, 0] = values[parameter.name]
                 found.add(name)
     return found
+
+
+def _with_own_delays(
+    robot: RobotModel, device: dict[str, tuple[list[float], list[str]]]
+) -> dict[str, tuple[list[float], list[str]]]:
+    """Return values without a MuJoCo field, with delays beyond the latency that stay those of the MJCF."""
+    delays, elements = device.get(custom_name(COMMAND_DELAY), ([], []))
+    for name, delay_s in zip(robot.actuator_names, robot.command_delay_s, strict=True):
+        if delay_s and name not in elements:
+            delays, elements = [*delays, float(delay_s)], [*elements, name]
+    return device | ({custom_name(COMMAND_DELAY): (delays, elements)} if elements else {})
 
 
 def custom_latency_s(model: Any) -> float:

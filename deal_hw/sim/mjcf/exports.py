@@ -316,7 +316,8 @@ def _actuator(robot: RobotModel, model: Any, result: CalibrationResult, number: 
         "effort_limit": effort,
         "velocity_limit": _device_value(robot, result, "servo_speed_limit", number),
         "free_speed": _device_value(robot, result, FREE_SPEED, number) if servo else None,
-        "delay_s": float(result.latency_s) + (_device_value(robot, result, "command_delay", number) or 0.0),
+        "delay_s": float(result.latency_s)
+        + (_device_value(robot, result, "command_delay", number) or float(robot.command_delay_s[number])),
     }
 
 

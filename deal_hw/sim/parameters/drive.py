@@ -175,6 +175,4 @@ def _problem(model: Any, actuator: int, effort: float, bias: FloatArray) -> str:
         )
     if filtered(model, actuator) and model.actuator_actlimited[actuator]:
         return "limits its filtered command (actrange); write ctrlrange instead"
-    if model.actuator_delay[actuator] > 0:
-        return "delays its command (delay); remove that, calibration finds the latency itself"
     return ""

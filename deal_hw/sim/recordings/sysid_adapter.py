@@ -28,7 +28,7 @@ import numpy as np
 from deal_hw.errors import ConfigurationError, MissingExtraError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
-from deal_hw.sim.engine.model import RobotModel, drop_filters, model_with
+from deal_hw.sim.engine.model import RobotModel, drop_command_laws, model_with
 from deal_hw.sim.parameters import KINDS
 from deal_hw.sim.parameters.fields import BatchFields
 from deal_hw.sim.parameters.one_drive import gather
@@ -354,7 +354,7 @@ class _Bridge:
             if len(self._models) > 4 * (len(self.space) + 1) * len(self._sent):
                 self._models.clear()
             model = model_with(dataclasses.replace(self.robot, model=self._nominal), self.space, theta)
-            drop_filters(model)
+            drop_command_laws(model)
             if self.robot.description.actuation == "position":
                 self._batch.set_parameters(theta[None])
                 self._batch.set_sent(*self._sent[id(spec)])

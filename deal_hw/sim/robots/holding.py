@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -42,7 +43,9 @@ class Holding:
 
 def hold(robot: UserRobot) -> Holding:
     """Simulate a robot that is commanded to hold its start pose; motors get no effort."""
-    model: Any = robot.model
+    model: Any = copy.copy(robot.model)
+    # A command that is held acts at once: MuJoCo begins with commands of 0 before.
+    model.actuator_delay[:] = 0.0
     description = robot.description()
     data = mujoco.MjData(model)
     driven = [model.joint(name) for name in description.actuated]

@@ -153,6 +153,8 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         require_base(robot, source.feet, trajectories)
     known_std = expected_std(settings.residual_std, robot, trajectories[0].base)
     provenance = dict(source.provenance)
+    if robot.latency_s:
+        provenance["model_latency_s"] = robot.latency_s
     fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
     if settings.named() in UNALIGNED_METHODS:
         say(

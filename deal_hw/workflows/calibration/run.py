@@ -253,7 +253,8 @@ def _checked(
 
 
 def _errors(of: HeldOut, theta: FloatArray, latency_s: float) -> HeldoutErrors:
-    return of.errors({"nominal": (of.space.nominal, 0.0), "calibrated": (theta, latency_s)})
+    nominal = of.space.nominal, of.problem.robot.latency_s
+    return of.errors({"nominal": nominal, "calibrated": (theta, latency_s)})
 
 
 def _with_errors(result: CalibrationResult, held_out: HeldOut) -> CalibrationResult:
