@@ -52,6 +52,16 @@ def test_values_that_are_not_numbers(make_table: MakeTable) -> None:
     assert verdict(make_table(target=target), "finite").severity is Severity.FAIL
 
 
+def test_infinite_values_are_named_once(make_table: MakeTable) -> None:
+    """A joint that reads inf in one sample is no joint in degrees, and reaches no limit."""
+    table = make_table()
+    position = table.position.copy()
+    position[100] = np.inf
+    free = np.array([[-np.inf, np.inf]] * 3)
+    found = examine(dataclasses.replace(table, position=position), free)
+    assert {f.code for f in found if f.severity is not Severity.OK} == {"finite"}
+
+
 def test_clock_going_backwards(make_table: MakeTable) -> None:
     """The last sample before, counted from 1, and the two stamps are named."""
     time_s = make_table().time_s.copy()

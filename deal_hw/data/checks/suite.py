@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -116,6 +117,7 @@ def examine(
     )
     if worst(first) is Severity.FAIL:
         return first
+    table = _numbers(table)
     clock = table.time_s[np.isfinite(table.position).all(axis=1)]
     rate = samples.check_rate(clock)
     if rate.severity is Severity.FAIL:
@@ -163,6 +165,16 @@ def nominal_period_s(trajectory: Trajectory) -> float:
 def despiked(table: Table, settings: SpikeSettings) -> Table:
     """Return a recording without the samples that jump and come back, see :class:`SpikeSettings`."""
     return _without(table, find_spikes(table.time_s, table.position, table.units, settings))
+
+
+def _numbers(table: Table) -> Table:
+    """Return a recording in which what is infinite is not a number: its size has no meaning."""
+    measured: dict[str, Any] = {
+        name: np.where(np.isfinite(values), values, np.nan)
+        for name in ("position", "velocity", "effort")
+        if (values := getattr(table, name)) is not None
+    }
+    return dataclasses.replace(table, **measured)
 
 
 def _without(table: Table, found: Sequence[Spike]) -> Table:
