@@ -249,7 +249,7 @@ class _Sipped(io.FileIO):
 
 
 def read_arrays(
-    source: Path | bytes, wanted: Callable[[np.dtype[Any], tuple[int, ...]], bool]
+    source: Path | bytes, unwanted: Callable[[np.dtype[Any], tuple[int, ...]], str]
 ) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, str]]:
     """Return the arrays of an NPZ file; to be called inside :func:`reading`.
 
@@ -258,7 +258,7 @@ def read_arrays(
 
     Args:
         source: The file, or its bytes.
-        wanted: Returns from kind and shape whether to read an array.
+        unwanted: Returns from kind and shape why not to read an array; "" to read it.
 
     Returns:
         The arrays by name, and the omitted ones with the reason.
@@ -281,8 +281,8 @@ def read_arrays(
                 count = math.prod(shape)
                 if dtype.hasobject:
                     left_out[name] = "Python objects, which could run anything"
-                elif not wanted(dtype, shape):
-                    left_out[name] = f"{short(dtype, 40)} {short(shape, 40)}"
+                elif reason := unwanted(dtype, shape):
+                    left_out[name] = reason
                 else:
                     budget -= count
                     size = count * dtype.itemsize

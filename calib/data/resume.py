@@ -100,7 +100,9 @@ def unpack(data: bytes) -> dict[str, Any]:
         DatasetError: These are not the bytes of a checkpoint.
     """
     with reading("the state", FORMAT):
-        arrays, left_out = read_arrays(data, lambda dtype, shape: dtype.kind in "biufc")
+        arrays, left_out = read_arrays(
+            data, lambda dtype, shape: "" if dtype.kind in "biufc" else "no numbers"
+        )
         if left_out:
             raise ValueError(f"{short(next(iter(left_out)), 60)} is no array of numbers")
         text = arrays.pop(_HEADER).tobytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import json
 from collections.abc import Callable
@@ -83,6 +84,102 @@ def test_csv_dialects(tmp_path: Path) -> None:
     assert "line 6 is incomplete" in channels.notes[0]
 
 
+NAMES = "time,a_pos,a_cmd"
+ROWS = ["0.00,0.5,0.25", "0.01,-1.5,2", "0.02,1e-3,3.5"]
+
+
+def dialect(text: str, delimiter: str = ",", point: str = ".", encoding: str = "utf-8") -> bytes:
+    """Return a table in another dialect of CSV."""
+    return text.replace(".", point).replace(",", delimiter).replace("~", ",").encode(encoding)
+
+
+@pytest.mark.parametrize(
+    ("data", "note"),
+    [
+        (dialect("\n".join([NAMES, *ROWS]), "  "), ""),
+        (dialect("\n".join([NAMES, *ROWS]), "\t", "~"), ""),
+        (dialect("\r\n".join([NAMES, *ROWS]), "|"), ""),
+        (dialect("\n".join([NAMES, *ROWS]), " ", "~"), ""),
+        (dialect("\n".join([NAMES, *ROWS]), ";", "~", "utf-16"), ""),
+        (dialect("\n".join([NAMES, *ROWS]), "\t", "~", "utf-16-be"), ""),
+        (dialect("\n".join(["sep=;", NAMES, *ROWS]), ";"), ""),
+        (dialect("\n".join([f"# {NAMES}", *ROWS]), " "), ""),
+        (dialect("\n".join([f"% {NAMES}", *ROWS])), ""),
+        (dialect("\n".join([f"{NAMES},", *(f"{row}," for row in ROWS)])), ""),
+        (dialect("\n".join(["Logger v2", "Date 30-11-2026", "", NAMES, *ROWS])), "left out: Logger v2; Date"),
+        (dialect("\n".join(["Logger,,", ",,", NAMES, *ROWS])), "before line 3, which names the columns"),
+        (dialect("\n".join([NAMES, "[s],[rad],[rad]", *ROWS])), "line 2 holds the units: s, rad, rad"),
+        (gzip.compress(dialect("\n".join([NAMES, *ROWS]))), ""),
+    ],
+)
+def test_csv_of_any_logger(tmp_path: Path, data: bytes, note: str) -> None:
+    """Delimiters, decimal commas, encodings and lines before the rows all give the same recording."""
+    (tmp_path / "r.csv").write_bytes(data)
+    said: list[str] = []
+    (table,) = load_tables(tmp_path / "r.csv", say=said.append)
+    np.testing.assert_allclose(table.time_s, [0, 0.01, 0.02], atol=1e-15)
+    assert table.position.ravel().tolist() == [0.5, -1.5, 1e-3]
+    assert table.target.ravel().tolist() == [0.25, 2, 3.5]
+    assert note in "\n".join(said)
+
+
+@pytest.mark.parametrize(
+    ("times", "steps"),
+    [
+        (["2026-11-30T23:59:59.995", "2026-12-01T00:00:00.005", "2026-12-01T00:00:00.015"], [0, 0.01, 0.02]),
+        (["2026-11-30 12:00:00.000000001Z", "2026-11-30 12:00:00.000000002Z"], [0, 1e-9]),
+        (["2026-11-30T12:00:00+01:00", "2026-11-30T11:00:00.5Z"], [0, 0.5]),
+        (["23:59:59.990", "00:00:00", "0:00:00.01"], [0, 0.01, 0.02]),
+        (["11:59:59.5 AM", "12:00:00.0 PM", "01:00:00 PM"], [0, 0.5, 3600.5]),
+        (["31.12.2026 23:59:59", "01.01.2027 00:00:00.25"], [0, 1.25]),
+        (["0 days 00:00:01.5", "1 days 00:00:01.5"], [0, 86400]),
+    ],
+)
+def test_csv_with_times_of_day(tmp_path: Path, times: list[str], steps: list[float]) -> None:
+    """Dates, times of day beyond midnight, time zones and halves of a day become seconds."""
+    rows = "\n".join(f"{time},{k}.5,1" for k, time in enumerate(times))
+    path = write(tmp_path / "r.csv", f"Zeit,a_pos,a_cmd\n{rows}\n")
+    said: list[str] = []
+    (table,) = load_tables(path, say=said.append)
+    np.testing.assert_allclose(table.time_s, steps, rtol=0, atol=5e-11)
+    assert f"the times of 'Zeit', such as '{times[0]}', are read as seconds" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time,a\n03/04/2026 12:00:00,1\n03/05/2026 12:00:00,2\n", "not a time: the date 03/05/2026 may be"),
+        ("time,a\n12:00:00,1\n12:xx,2\n", "line 3, column 'time' contains '12:xx', not a time"),
+        ("t,a\n0,x\n1,2\n2,3\n", "line 2, column 'a' contains 'x', not a number"),
+        ("t,a\n0,00,1,5\n0,01,2,5\n", "has 4 cells, but the header in line 1 has 2.*decimal commas"),
+        ("time,a_pos,a_cmd\ns,rev,rev\n0,1,2\n", "the unit of 'a_pos' is 'rev'; known are rad, deg, m, mm"),
+    ],
+)
+def test_csv_that_cannot_be_told(tmp_path: Path, text: str, words: str) -> None:
+    """The date, the cell, the delimiter or the unit is named."""
+    with pytest.raises(DatasetError, match=words):
+        load_tables(write(tmp_path / "r.csv", text))
+
+
+@pytest.mark.parametrize(
+    ("header", "position", "seconds"),
+    [
+        ("time [ms];a_pos [°];a_cmd [°]", np.pi / 180, 1e-3),
+        ("Timestamp(us);a_pos (deg);a_cmd (deg)", np.pi / 180, 1e-6),
+        ("t_ns;a_pos;a_cmd", 1, 1e-9),
+        ("elapsed_time [s];a_pos[rad];a_cmd[rad]", 1, 1),
+        ("Zeit;a_pos;a_cmd\n(ms);(deg);(deg)", np.pi / 180, 1e-3),
+    ],
+)
+def test_csv_units_in_brackets(tmp_path: Path, header: str, position: float, seconds: float) -> None:
+    """A unit behind a name, or in a line below the names, is that of the column."""
+    (tmp_path / "r.csv").write_bytes(f"{header}\n0,0;1;2\n0,5;2;3\n1,0;3;4\n".encode("cp1252"))
+    (table,) = load_tables(tmp_path / "r.csv", joints=["a"])
+    np.testing.assert_allclose(table.time_s, [0, 0.5 * seconds, seconds])
+    np.testing.assert_allclose(table.position[:, 0], np.array([1, 2, 3]) * position)
+    np.testing.assert_allclose(table.target[:, 0], np.array([2, 3, 4]) * position)
+
+
 def test_csv_lists_in_cells(tmp_path: Path) -> None:
     """A list in each cell becomes an array; an empty cell a row of NaN."""
     path = write(tmp_path / "r.csv", 't,q\n0,\n1,"[1.0, 2.0]"\n2,"[3.0, 4.0]"\n')
@@ -139,6 +236,22 @@ def test_npz_arrays(tmp_path: Path) -> None:
     np.testing.assert_array_equal(table.position, q)
     with pytest.raises(DatasetError, match="which joints the 3 columns"):
         load_tables(tmp_path / "b.npz", joints=("u", "v"))
+
+
+def test_npz_of_other_shapes(tmp_path: Path) -> None:
+    """A time of one column is read; an array whose rows are joints, and a batch, are named."""
+    time, q = np.arange(6.0)[:, None] / 100, np.arange(12.0).reshape(6, 2)
+    path = tmp_path / "a.npz"
+    np.savez(path, time=time, dof_pos=q, des_dof_pos=q + 1, joint_names=np.array(["a", "b"]))
+    (table,) = load_tables(path)
+    np.testing.assert_allclose(table.time_s, time[:, 0])
+    np.testing.assert_array_equal(table.target, q + 1)
+    np.savez(path, time=time, dof_pos=q.T, des_dof_pos=q.T)
+    with pytest.raises(DatasetError, match=r"'dof_pos' has shape \(2, 6\), but there are 6 times.*transpose"):
+        load_tables(path, joints=("a", "b"))
+    np.savez(path, time=time, dof_pos=q[None], des_dof_pos=q[None])
+    with pytest.raises(DatasetError, match=r"dof_pos is left out: float64 \(1, 6, 2\) is a batch; save each"):
+        load_tables(path, joints=("a", "b"))
 
 
 def test_npz_with_several_lists_of_names(tmp_path: Path) -> None:

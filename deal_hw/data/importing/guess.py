@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels
-from deal_hw.data.importing.columns import POSITION_UNITS, ColumnMap, JointColumns, TimeColumn
+from deal_hw.data.importing.columns import (
+    EFFORT_UNITS,
+    POSITION_UNITS,
+    SPEED_UNITS,
+    ColumnMap,
+    JointColumns,
+    TimeColumn,
+)
 from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
@@ -25,9 +33,36 @@ _WORDS = {
 _ROLE = {word: role for role, words in _WORDS.items() for word in words.split()}
 _FILLERS = {"dof", "joint", "joints", "motor", "motors"}
 _UNITS = {"rad": "rad", "radians": "rad", "deg": "deg", "degrees": "deg", "mm": "mm"}
-_TIME_NAMES = ("time", "timestamp", "timestamps", "t", "stamp", "log_time")
-_TIME_SUFFIXES = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "ns": "ns"}
-_COMMAND_TIMES = ("command_time", "time_command", "target_time", "command_time_s")
+"""Words of a name that are a unit."""
+_GIVEN_UNITS = _UNITS | {
+    **dict.fromkeys(("radian", "rads"), "rad"),
+    **dict.fromkeys(("°", "degree"), "deg"),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
+    "millimeters": "mm",
+    **dict.fromkeys(("nm", "n*m", "n·m", "n m", "n.m"), "Nm"),
+    "n": "N",
+    **{
+        f"{name}/s": f"{unit}/s"
+        for name, unit in (("rad", "rad"), ("deg", "deg"), ("°", "deg"), ("m", "m"), ("mm", "mm"))
+    },
+    **dict.fromkeys(("", "-", "1"), ""),
+}
+"""Units in brackets behind a name, or in a line of units, in lower case."""
+_TIME_NAMES = (
+    *("time", "timestamp", "timestamps", "t", "stamp", "log_time", "time_stamp", "datetime", "date_time"),
+    *("sim_time", "elapsed", "elapsed_time"),
+)
+_TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanosecond", "nanoseconds"), "ns"),
+}
+"""Names of units of time, in lower case."""
+_IN_BRACKETS = re.compile(r"\s*[\[({]\s*([^\[\](){}]*?)\s*[\])}]\s*")
+"""A unit behind a name."""
+_TIME_AND_UNIT = re.compile(r"(.+?)[\s_]*(?:[\[({/,]\s*([a-zµμ]+)\s*[\])}]?|[_ ]([a-zµμ]+))")
+_COMMAND_TIMES = ("command_time", "time_command", "target_time")
 _SPLIT = re.compile(r"[^A-Za-z0-9]+")
 
 
@@ -40,7 +75,7 @@ class _Guess:
         stem: The remaining words, lower case: the joint; empty for an array of all joints.
         original: The same in the file's spelling.
         role: "position", "target", "velocity", "effort", or "" for none of them.
-        unit: One of the units of position; "" if the name has none.
+        unit: In the spelling of column maps, or as it is written if that is unknown; "" if none is given.
     """
 
     channel: str
@@ -77,7 +112,7 @@ def guess_columns(
         raise unguessed(
             channels, "which channel is the time (if there is none, add one with the time of each sample)"
         )
-    guesses = [_read_name(name, joints or ()) for name in channels.arrays]
+    guesses = _read_names(channels, joints)
     arrays = {
         guess.role: guess
         for guess in guesses
@@ -88,8 +123,27 @@ def guess_columns(
     return _from_columns(channels, time, guesses, joints)
 
 
-def _read_name(channel: str, joints: Iterable[str]) -> _Guess:
-    words = [word for word in _SPLIT.split(channel) if word]
+def _read_names(channels: Channels, joints: Iterable[str] | None) -> list[_Guess]:
+    guesses = []
+    for name, values in channels.arrays.items():
+        given = channels.units.get(name, ()) if values.ndim == 1 else ()
+        guesses.append(_read_name(name, joints or (), *given[:1]))
+    return guesses
+
+
+def _read_name(channel: str, joints: Iterable[str], given: str = "") -> _Guess:
+    """Return what a channel's name says; a unit that the file gives comes before that of the name."""
+    stem = channel
+    if (match := _IN_BRACKETS.search(channel)) and match.end() == len(channel) and not match[1].isdigit():
+        stem, given = channel[: match.start()], given or match[1]
+    found = _read_words(channel, stem, joints)
+    if not given:
+        return found
+    return dataclasses.replace(found, unit=_GIVEN_UNITS.get(given.lower(), given))
+
+
+def _read_words(channel: str, words_of: str, joints: Iterable[str]) -> _Guess:
+    words = [word for word in _SPLIT.split(words_of) if word]
     lower = [word.lower() for word in words]
     joint = _joint_in(lower, joints)
     rest = list(range(len(words)))
@@ -164,8 +218,8 @@ def _from_arrays(
     command_time = None
     if "target" in arrays and len(channels.arrays[arrays["target"].channel]) != len(channels.arrays[array]):
         command_time = _guess_command_time(channels, arrays["target"].channel)
-    elif any(name in channels.arrays for name in _COMMAND_TIMES):
-        command_time = _guess_command_time(channels, "")
+    else:
+        command_time = _named_command_time(channels)
     if topic.startswith("/"):
         time = _guess_time(channels, channels.arrays, (f"{topic}.",)) or time
         command_time = _guess_command_time(channels, arrays["target"].channel) if "target" in arrays else None
@@ -221,7 +275,7 @@ def channels_of_joints(
     channels: Channels, time: TimeColumn | None, joints: Sequence[str] | None = None
 ) -> dict[str, dict[str, str]]:
     """Return the channels with a joint's name and a known quantity: by joint, then quantity."""
-    guesses = [_read_name(name, joints or ()) for name in channels.arrays]
+    guesses = _read_names(channels, joints)
     found = _by_joint(channels, time, guesses, joints)
     return {name: {role: g.channel for role, g in roles.items()} for name, roles in found.items()}
 
@@ -259,11 +313,10 @@ def _from_columns(
     if not found:
         raise unguessed(channels, "which channels are the joints' positions")
     ordered = [name for name in (joints or found) if name in found]
-    own_time = any(name in channels.arrays for name in _COMMAND_TIMES)
     return ColumnMap(
         time=time,
-        command_time=_guess_command_time(channels, "") if own_time else None,
-        joints=tuple(_joint(name, found[name]) for name in ordered),
+        command_time=_named_command_time(channels),
+        joints=tuple(_joint(channels, name, found[name]) for name in ordered),
         source=("guessed",),
     )
 
@@ -272,9 +325,19 @@ def _has_role_word(channel: str) -> bool:
     return any(word.lower() in _ROLE for word in _SPLIT.split(channel))
 
 
-def _joint(name: str, roles: dict[str, _Guess]) -> JointColumns:
+_TARGET_UNITS = [*POSITION_UNITS, *EFFORT_UNITS, *SPEED_UNITS]
+
+
+def _joint(channels: Channels, name: str, roles: dict[str, _Guess]) -> JointColumns:
     unit = roles["position"].unit or "rad"
     target = roles.get("target")
+    for guess, known in ((roles["position"], [*POSITION_UNITS]), (target, _TARGET_UNITS)):
+        if guess is not None and guess.unit and guess.unit not in known:
+            raise DatasetError(
+                f"{channels.path}: the unit of {guess.channel!r} is {short(guess.unit, 40)!r}; known are "
+                f"{', '.join(known)}. Convert it, or write its scale into a column map, such as "
+                f"joints: [{{name: {name}, normalised: {{from: [0, 1], to: [0, 6.2832]}}}}]"
+            )
     chosen: dict[str, Any] = {role: guess.channel for role, guess in roles.items()}
     return JointColumns(
         name=name,
@@ -291,36 +354,61 @@ def guess_time(channels: Channels) -> TimeColumn | None:
 
 def _guess_time(channels: Channels, names: Iterable[str], prefixes: tuple[str, ...]) -> TimeColumn | None:
     """Return the time channel under one of the prefixes, with its unit by its name, else by its steps."""
-    by_lower = {name.lower(): name for name in names if channels.arrays[name].ndim == 1}
+    stamps = {name: values for name in names if (values := channels.arrays[name]).size == len(values)}
+    named: dict[str, list[tuple[str, str]]] = {}
+    for name in stamps:
+        for base, unit in _readings_of_time(name.lower()):
+            named.setdefault(base, []).append((name, unit))
     for prefix in prefixes:
-        for base in ("header.stamp", *_TIME_NAMES):
-            if (name := by_lower.get(f"{prefix}{base}")) is not None:
-                known = "s" if base in ("header.stamp", "log_time") else ""
-                if base != "header.stamp" or np.ptp(channels.arrays[name]) > 0:
-                    return TimeColumn(column=name, unit=known or _unit_of(channels.arrays[name]))
-            for suffix, unit in _TIME_SUFFIXES.items():
-                for joined in (
-                    f"{prefix}{base}_{suffix}",
-                    f"{prefix}{base} [{suffix}]",
-                    f"{prefix}{base}[{suffix}]",
-                ):
-                    if (name := by_lower.get(joined)) is not None:
-                        return TimeColumn(column=name, unit=unit)
-    stamped = [name for name in by_lower.values() if name.endswith((".header.stamp", ".log_time"))]
-    return TimeColumn(column=stamped[0]) if stamped else None
+        for base in ("header.stamp", *_TIME_NAMES, *_TIME_UNITS):
+            for name, unit in named.get(f"{prefix}{base}", ()):
+                known = "s" if base in ("header.stamp", "log_time") else unit or _TIME_UNITS.get(base, "")
+                if base != "header.stamp" or np.ptp(stamps[name]) > 0:
+                    return _time_column(channels, name, known)
+    stamped = [name for name in stamps if name.lower().endswith((".header.stamp", ".log_time"))]
+    if stamped:
+        return TimeColumn(column=stamped[0])
+    # A single channel in a unit of time needs no name.
+    timed = {name: given[0].lower() for name in stamps if (given := channels.units.get(name, ()))}
+    timed = {name: _TIME_UNITS[unit] for name, unit in timed.items() if unit in _TIME_UNITS}
+    return TimeColumn(column=next(iter(timed)), unit=next(iter(timed.values()))) if len(timed) == 1 else None
+
+
+def _time_column(channels: Channels, name: str, unit: str) -> TimeColumn:
+    """Return a channel of time: in a unit that is known by its name, else by the file, else by its steps."""
+    given = (*channels.units.get(name, ()), "")[0].lower()
+    known = unit or _TIME_UNITS.get(given, "")
+    return TimeColumn(column=name, unit=known or _unit_of(np.ravel(channels.arrays[name])))
+
+
+def _readings_of_time(name: str) -> list[tuple[str, str]]:
+    """Return a channel's name, and the same without a unit of time at its end and with that unit."""
+    readings = [(name, "")]
+    if match := _TIME_AND_UNIT.fullmatch(name):
+        unit = _TIME_UNITS.get(match[2] or match[3], "")
+        if unit:
+            readings.append((match[1], unit))
+    return readings
 
 
 def _guess_command_time(channels: Channels, target: str) -> TimeColumn | None:
     topic = target.rpartition(".")[0]
     if topic.startswith("/"):
         return _guess_time(channels, channels.arrays, (f"{topic}.",))
-    for name in _COMMAND_TIMES:
-        if name in channels.arrays:
-            unit = "s" if name.endswith("_s") else _unit_of(channels.arrays[name])
-            return TimeColumn(column=name, unit=unit)
+    if (named := _named_command_time(channels)) is not None:
+        return named
     rows = len(channels.arrays[target]) if target in channels.arrays else 0
     other = f", which has {rows} rows and not those of the time" if rows else ""
     raise unguessed(channels, f"which channel is the time of {target!r}{other}")
+
+
+def _named_command_time(channels: Channels) -> TimeColumn | None:
+    """Return the channel whose name says that it is the time of the commands."""
+    for name in channels.arrays:
+        for base, unit in _readings_of_time(name.lower()):
+            if base in _COMMAND_TIMES:
+                return _time_column(channels, name, unit)
+    return None
 
 
 def _unit_of(stamps: FloatArray) -> str:
@@ -340,7 +428,26 @@ def is_target(name: str) -> bool:
 
 def unguessed(channels: Channels, what: str) -> DatasetError:
     """Return the error that names what cannot be guessed, and the channels."""
+    noted = f"; {short('; '.join(channels.notes), 300)}" if channels.notes else ""
     return DatasetError(
-        f"{channels.path}: cannot tell {what} (channels: {channels.listed()}); write it into a column map, "
-        "columns.yaml, and name that by --columns (in Python: columns=)"
+        f"{channels.path}: cannot tell {what} (channels: {channels.listed()}{noted}); write it into a column "
+        "map, columns.yaml, and name that by --columns (in Python: columns=)"
     )
+
+
+def check_rows(channels: Channels) -> None:
+    """Check that each array of a recording with one clock has a row for each time.
+
+    Raises:
+        DatasetError: The rows of one are its columns.
+    """
+    time = guess_time(channels)
+    if time is None:
+        return
+    rows = len(channels.arrays[time.column])
+    for name, values in channels.arrays.items():
+        if values.ndim == 2 and values.shape[0] != rows == values.shape[1]:
+            raise DatasetError(
+                f"{channels.path}: {name!r} has shape {values.shape}, but there are {rows} times; a row is a "
+                "sample and a column a joint: give its transpose, .T"
+            )

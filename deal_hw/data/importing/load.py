@@ -28,9 +28,7 @@ MapOf = Callable[[Channels], ColumnMap | None]
 """Returns the column map of a file's channels; None: it is guessed."""
 _CSV = "deal_hw.data.importing.csv_source:read_csv"
 _READERS = {
-    ".csv": _CSV,
-    ".tsv": _CSV,
-    ".txt": _CSV,
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".csv.gz", ".tsv.gz", ".txt.gz"), _CSV),
     ".npz": "deal_hw.data.importing.npz_source:read_npz",
     ".mcap": "deal_hw.data.importing.mcap_source:read_mcap",
     ".db3": "deal_hw.data.importing.bag_source:read_bag",
@@ -58,7 +56,7 @@ def read_channels(path: Path, say: Say | None = None) -> list[Channels]:
         raise DatasetError(f"{path} does not exist; check its name")
     if is_episode(path):
         return [read_own(path)]
-    reader = _READERS.get(path.suffix.lower())
+    reader = next((one for end, one in _READERS.items() if path.name.lower().endswith(end)), None)
     if reader is None:
         raise DatasetError(
             f"{path}: files ending in {path.suffix or 'nothing'!r} are not known; "

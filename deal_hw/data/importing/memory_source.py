@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from deal_hw.data.importing.channels import Channels, as_floats
-from deal_hw.data.importing.guess import guess_time
+from deal_hw.data.importing.guess import check_rows
 from deal_hw.errors import DatasetError, short
 from deal_hw.types import FloatArray
 
@@ -47,14 +47,7 @@ def read_memory(values: Any, name: str) -> Channels:
         digest.update(key.encode())
         digest.update(array.tobytes())
     channels = Channels(Path(name), "arrays", digest.hexdigest(), arrays, joint_names=names)
-    time = guess_time(channels)
-    rows = None if time is None else len(arrays[time.column])
-    for key, array in arrays.items():
-        if array.ndim == 2 and array.shape[0] != rows == array.shape[1]:
-            raise DatasetError(
-                f"{name}[{key!r}] has shape {array.shape}, but there are {rows} times; a row is a sample and "
-                "a column a joint: give its transpose, .T"
-            )
+    check_rows(channels)
     return channels
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from deal_hw.data.importing.channels import Channels, as_floats, digest_of_file
+from deal_hw.data.importing.channels import Channels, as_floats, digest_of_file, unwanted
+from deal_hw.data.importing.guess import check_rows
 from deal_hw.errors import DatasetError, short
-from deal_hw.reading import NAMES, RECORDING_BYTES, check_size, read_arrays, reading
+from deal_hw.reading import RECORDING_BYTES, check_size, read_arrays, reading
 
 JOINT_NAMES = ("joint_names", "joints", "dof_names", "names")
 """Arrays of text that name the joints."""
@@ -23,7 +21,7 @@ def read_npz(path: Path) -> Channels:
     anything. Sizes are limited, see :mod:`deal_hw.reading`.
 
     Raises:
-        DatasetError: It cannot be read.
+        DatasetError: It cannot be read, or an array's rows are its joints.
     """
     path = Path(path)
     with reading(path, "NPZ", "save it with numpy.savez(path, time=..., position=...)"):
@@ -34,7 +32,7 @@ def read_npz(path: Path) -> Channels:
                 raise DatasetError(
                     f"{path} holds one unnamed array; save it with numpy.savez(path, time=...)"
                 )
-        found, left_out = read_arrays(path, _is_channel)
+        found, left_out = read_arrays(path, unwanted)
         texts = {name: values for name, values in found.items() if values.dtype.kind in "US"}
         arrays = {name: as_floats(values) for name, values in found.items() if name not in texts}
         # With several, such as names of actuators or bodies too, the wrong one would swap joints.
@@ -42,10 +40,8 @@ def read_npz(path: Path) -> Channels:
         joint_names = tuple(str(text) for name in chosen for text in texts[name].astype(str))
         left_out |= {name: "not the joints' names" for name in texts if name not in chosen}
     notes = tuple(f"{short(name, 60)} is left out: {why}" for name, why in left_out.items())
-    return Channels(path=path, kind="npz", digest=digest, arrays=arrays, joint_names=joint_names, notes=notes)
-
-
-def _is_channel(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bool:
-    if dtype.kind in "US":
-        return len(shape) == 1 and shape[0] <= NAMES
-    return dtype.kind in "fiub" and len(shape) in (1, 2) and (len(shape) == 1 or shape[1] <= NAMES)
+    channels = Channels(
+        path=path, kind="npz", digest=digest, arrays=arrays, joint_names=joint_names, notes=notes
+    )
+    check_rows(channels)
+    return channels
