@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.data.importing.stamps import even_counts
 from deal_hw.data.table import Table
 from deal_hw.errors import DatasetError
 from deal_hw.types import BaseTrajectory, BodyTrajectory, FloatArray, IntArray, Status, Trajectory
@@ -70,15 +71,12 @@ def period_of(table: Table) -> float:
     Raises:
         DatasetError: There are fewer than three samples, or the clock stands still.
     """
-    steps = np.diff(_clock(table)[0])
-    steps = steps[steps > 0]
-    if steps.size < 2:
+    clock = _clock(table)[0]
+    if clock.size < 3:
         raise DatasetError(
-            f"{table.name}: only {steps.size + 1} samples at different times; check the time channel"
+            f"{table.name}: only {max(clock.size, 1)} samples at different times; check the time channel"
         )
-    median = float(np.median(steps))
-    inside = steps[steps <= GAP_PERIODS * median]
-    return float(np.sum(inside) / np.sum(np.maximum(np.round(inside / median), 1)))
+    return even_counts(clock)[1]
 
 
 def common_period(tables: Sequence[Table]) -> float:

@@ -16,6 +16,8 @@ from deal_hw.data.importing.channels import Channels, digest_of_file
 from deal_hw.data.importing.columns import EFFORT_UNITS, ColumnMap, JointColumns, JointKinds, TimeColumn
 from deal_hw.data.importing.guess import channels_of_joints, guess_columns, guess_time
 from deal_hw.data.importing.guess_topics import guess_topics
+from deal_hw.data.importing.repeats import without_repeats
+from deal_hw.data.importing.stamps import on_even_clock
 from deal_hw.data.importing.table import build_table
 from deal_hw.data.recording.schemas import METADATA_NAME
 from deal_hw.data.table import Table, table_of
@@ -136,6 +138,12 @@ def tables_of(
             asked = joints if joints is None else [name for name in joints if name not in led or name in has]
             _tell(say, channels, used, asked, mapped is None and number == 0, printed)
         table = build_table(channels, used, joints)
+        for fact, mended in (("repeats", without_repeats), ("stamps", on_even_clock)):
+            table, text = mended(table)
+            if text:
+                table.source[fact] = text
+            if text and say is not None:
+                say(f"{table.name}: {text}")
         if unsaid := _unsaid(table, used):
             table.source["unsaid"] = unsaid
         if efforts := {j.name: j.target_unit for j in used.joints if j.target_unit in EFFORT_UNITS}:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from deal_hw.data.importing.channels import Channels, as_floats, digest_of_file, unwanted
 from deal_hw.data.importing.guess import check_rows
@@ -39,9 +42,21 @@ def read_npz(path: Path) -> Channels:
         chosen = list(texts) if len(texts) < 2 else [name for name in JOINT_NAMES if name in texts][:1]
         joint_names = tuple(str(text) for name in chosen for text in texts[name].astype(str))
         left_out |= {name: "not the joints' names" for name in texts if name not in chosen}
-    notes = tuple(f"{short(name, 60)} is left out: {why}" for name, why in left_out.items())
+    notes = (
+        *(f"{short(name, 60)} is left out: {why}" for name, why in left_out.items()),
+        *(_coarse(name, values) for name, values in found.items() if values.dtype == np.float16),
+    )
     channels = Channels(
         path=path, kind="npz", digest=digest, arrays=arrays, joint_names=joint_names, notes=notes
     )
     check_rows(channels)
     return channels
+
+
+def _coarse(name: str, values: np.ndarray[Any, np.dtype[np.float16]]) -> str:
+    """Return the note on half-precision numbers, which have three digits."""
+    most = np.max(np.abs(values[np.isfinite(values)]), initial=np.float16(0))
+    return (
+        f"{short(name, 60)} has half precision (float16): at {most:.4g} its values come in steps of "
+        f"{np.spacing(most):.2g}. Save float64"
+    )
