@@ -204,7 +204,7 @@ def changed(statement: str) -> Callable[[Path], None]:
         (changed("UPDATE messages SET data = 'text'"), "is no message"),
         (changed("UPDATE messages SET data = x'28B52FFD00'"), "its messages are compressed"),
         (changed("UPDATE messages SET data = x'0001'"), "bag.db3"),
-        (changed("UPDATE topics SET serialization_format = 'json'"), "not in ROS 2's encoding"),
+        (changed("UPDATE topics SET serialization_format = 'json'"), "not in ROS 2's CDR"),
     ],
 )
 def test_damaged_and_hostile_files_are_one_line(

@@ -22,6 +22,7 @@ from deal_hw.data.importing.load import is_episode, load_tables, read_channels
 from deal_hw.data.importing.mcap_source import read_mcap
 from deal_hw.data.importing.npz_source import read_npz
 from deal_hw.data.importing.table import build_table
+from deal_hw.data.recording import schemas
 from deal_hw.data.recording.schemas import RosMessageType
 from deal_hw.errors import ConfigurationError, DatasetError, UnknownNameError
 
@@ -287,7 +288,11 @@ def test_npz_never_unpickles(tmp_path: Path) -> None:
         read_npz(tmp_path / "one.npy")
 
 
-def joint_states(path: Path, orders: list[tuple[str, ...]]) -> Path:
+Other = tuple[str, str, str, str, bytes, bytes]
+"""Topic, encoding of messages, type, encoding of its definition, that, and a message."""
+
+
+def joint_states(path: Path, orders: list[tuple[str, ...]], other: Other | None = None) -> Path:
     """Write JointState-like messages at 10 ms and commands at 20 ms, joints in the given orders."""
     values = {"left": 1.0, "right": 2.0}
     with open(path, "wb") as file:
@@ -296,6 +301,12 @@ def joint_states(path: Path, orders: list[tuple[str, ...]]) -> Path:
         schema = writer.register_schema(JOINT_STATE.name, "ros2msg", JOINT_STATE.definition.encode())
         state = writer.register_channel("/joint_states", "cdr", schema)
         command = writer.register_channel("/joint_command", "cdr", schema)
+        if other is not None:
+            topic, encoding, kind, language, definition, message = other
+            channel = writer.register_channel(
+                topic, encoding, writer.register_schema(kind, language, definition)
+            )
+            writer.add_message(channel, 1_700_000_001_000_000_000, message, 1_700_000_001_000_000_000)
         zero_ns = 1_700_000_000_123_456_789
         for number, order in enumerate(orders):
             position = [values[name] + number for name in order]
@@ -337,11 +348,48 @@ def test_mcap_joint_states(tmp_path: Path) -> None:
     assert table.position[:, 0].tolist() == [1, 2, 3, 4] and table.target[:, 0].tolist() == [10, 12]
 
 
-def test_mcap_with_changing_joints_is_refused(tmp_path: Path) -> None:
-    """Two publishers on one topic are named as the trouble."""
-    path = joint_states(tmp_path / "bag.mcap", [("left", "right"), ("left",)])
-    with pytest.raises(DatasetError, match="its own topic"):
-        read_mcap(path)
+@pytest.mark.parametrize(
+    ("other", "why"),
+    [
+        (
+            ("/x", "json", "Note", "jsonschema", b"{}", b'{"a": 1}'),
+            "its messages are json, not in ROS 2's CDR",
+        ),
+        (
+            ("/x", "protobuf", "foxglove.Log", "protobuf", b"\n\xc8\xff", b"\x08\x01"),
+            "its messages are proto",
+        ),
+        (
+            ("/x", "cdr", "p/msg/X", "ros2idl", b"module p {};", bytes(12)),
+            "its definition is ros2idl, not",
+        ),
+        (("/x", "cdr", "p/msg/Own", "", b"", bytes(12)), "the bag holds no definition of p/msg/Own"),
+        (
+            ("/x", "cdr", "p/msg/Own", "ros2msg", b"float64 1x", bytes(12)),
+            "its definition cannot be",
+        ),
+    ],
+)
+def test_mcap_with_a_topic_of_another_kind(tmp_path: Path, other: Other, why: str) -> None:
+    """That topic is left out with the reason; the rest is read."""
+    path = joint_states(tmp_path / "bag.mcap", [("left", "right")] * 4, other)
+    found = read_mcap(path)
+    assert len(found.notes) == 1 and found.notes[0].startswith(f"/x is left out: {why}")
+    plain = read_mcap(joint_states(tmp_path / "plain.mcap", [("left", "right")] * 4))
+    assert found.arrays.keys() == plain.arrays.keys()
+    np.testing.assert_array_equal(found.arrays["/joint_states.position"], [[1, 2], [2, 3], [3, 4], [4, 5]])
+
+
+def test_mcap_with_a_known_message_needs_no_definition(tmp_path: Path) -> None:
+    """JointState is read also where the bag holds only its name, as in SQLite bags of ROS 2 Humble."""
+    kind = "sensor_msgs/msg/JointState"
+    message = schemas.JOINT_STATE.encode(0, 0, "", ("a",), [0.5], [], [])
+    found = read_mcap(joint_states(tmp_path / "b.mcap", [("left",)], ("/x", "cdr", kind, "", b"", message)))
+    assert found.notes == () and found.arrays["/x.position"].tolist() == [[0.5]]
+
+
+def test_what_is_no_mcap_is_refused(tmp_path: Path) -> None:
+    """The message says what kind of file was expected."""
     with pytest.raises(DatasetError, match="cannot be read as MCAP"):
         read_mcap(write(tmp_path / "x.mcap", "no mcap"))
 

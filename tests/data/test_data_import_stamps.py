@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,9 +129,9 @@ def test_lost_samples_and_pauses_stay(make_table: MakeTable) -> None:
 
 def test_half_precision_is_said(tmp_path: Path) -> None:
     """Time as float16 comes in steps of 4 and 8 ms from 4 s on; the rate is right all the same."""
-    arrays = {"time": TRUE_S, "dof_pos": motion(TRUE_S), "des_dof_pos": motion(TRUE_S, 0)}
-    names = np.array(["a", "b"])
-    np.savez(tmp_path / "r.npz", joint_names=names, **{k: v.astype(np.float16) for k, v in arrays.items()})
+    arrays: dict[str, Any] = {"time": TRUE_S, "dof_pos": motion(TRUE_S), "des_dof_pos": motion(TRUE_S, 0)}
+    halves = {name: values.astype(np.float16) for name, values in arrays.items()}
+    np.savez(tmp_path / "r.npz", joint_names=np.array(["a", "b"]), **halves)
     said: list[str] = []
     (found,) = load_tables(tmp_path / "r.npz", say=said.append)
     assert period_of(found) == pytest.approx(0.01, rel=2e-4)

@@ -16,7 +16,8 @@ from mcap_ros2.writer import Writer
 from deal_hw.cli.data import Import, data
 from deal_hw.data.importing import mcap_source
 from deal_hw.data.importing.columns import parse_column_map
-from deal_hw.data.importing.load import load_tables
+from deal_hw.data.importing.load import load_tables, tables_of
+from deal_hw.data.importing.memory_source import read_memory
 from deal_hw.data.recording.dataset import Dataset
 from deal_hw.data.table import table_of
 from deal_hw.errors import ConfigurationError, DatasetError
@@ -154,6 +155,71 @@ def suggested(text: str) -> Any:
     found = re.search(r"such as (\{.*\})|channel: (\{.*\})", text)
     assert found is not None
     return parse_yaml(found[1] or found[2])
+
+
+def test_an_arm_and_its_gripper_are_merged_by_name(tmp_path: Path) -> None:
+    """Each publishes its own joints, the gripper at half the rate; the arm's controller commands two."""
+    rows: list[Rows] = []
+    for number in range(40):
+        arm = joint_state(number, ["b", "a"], [number, -number])
+        here = [
+            ("/joint_states", STATE, arm),
+            (TOPICS[ARRAY], ARRAY, command(ARRAY, number, [], [number + 1, 7])),
+        ]
+        if number % 2 == 0:
+            here.append(("/joint_states", STATE, joint_state(number, ["finger"], [0.1 * number])))
+        rows.append(here)
+    said: list[str] = []
+    (table,) = load_tables(bag(tmp_path / "b.mcap", rows), joints=("a", "b"), say=said.append)
+    assert "a, b: 40; finger: 20 messages): they are merged by name" in said[0]
+    np.testing.assert_array_equal(table.position, np.stack([-np.arange(40), np.arange(40)], axis=1))
+    np.testing.assert_array_equal(table.target, np.stack([np.full(40, 7), np.arange(40) + 1], axis=1))
+    found = mcap_source.read_mcap(tmp_path / "b.mcap")
+    assert found.labels["/joint_states.position"] == ("b", "a", "finger")
+    np.testing.assert_allclose(found.arrays["/joint_states.position"][:, 2], 0.1 * np.r_[:39, 38], atol=1e-9)
+
+
+def test_velocities_of_some_messages_are_left_out_with_a_note(tmp_path: Path) -> None:
+    """A driver that reports no velocity now and then has none."""
+    rows = [
+        [("/joint_states", STATE, {**joint_state(k, ["a"], [k]), "velocity": [1.0] if k % 4 else []})]
+        for k in range(8)
+    ]
+    found = mcap_source.read_mcap(bag(tmp_path / "b.mcap", rows))
+    assert "/joint_states.velocity" not in found.arrays
+    assert found.notes == ("/joint_states.velocity is left out: 2 of 8 messages have 0 values, others 1",)
+
+
+@pytest.mark.parametrize("second", ["another", "zeros", "joint"])
+def test_two_publishers_on_one_topic_are_refused(tmp_path: Path, second: str) -> None:
+    """Their joints are alike and their values not."""
+    rows: list[Rows] = []
+    for number in range(90):
+        own = [np.sin(0.05 * number), np.cos(0.03 * number)]
+        other = {"another": [0.3, 0.4], "zeros": [0.0, 0.0], "joint": [own[0], 0.2]}[second]
+        here: Rows = [
+            ("/joint_states", STATE, joint_state(number, ["a", "b"], own)),
+            (TOPICS[ARRAY], ARRAY, command(ARRAY, number, [], own)),
+        ]
+        if number % 2:
+            here = [*here, ("/joint_states", STATE, joint_state(number, ["a", "b"], other))]
+        rows.append(here)
+    path = bag(tmp_path / "b.mcap", rows)
+    with pytest.raises(DatasetError, match=r"two sources are interleaved: \d\d% of the samples"):
+        load_tables(path)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 1000), noise=st.sampled_from([0.0, 1e-3, 1.0]), steps=st.booleans())
+def test_one_source_is_not_taken_for_two(seed: int, noise: float, steps: bool) -> None:
+    """Neither smooth motion, nor noise, nor a joint that jumps between two places is two sources."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(400) / 100
+    motion = np.sin(np.outer(time, rng.uniform(1, 60, 2)) + rng.uniform(0, 6, 2))
+    position = (np.sign(motion) if steps else motion) + rng.normal(0, noise, motion.shape)
+    values = {"time": time, "position": position, "target": position, "joints": ["a", "b"]}
+    (table,) = tables_of([read_memory(values, "r")])
+    assert table.joint_names == ("a", "b")
 
 
 def test_a_controllers_state_comes_before_its_goals(tmp_path: Path) -> None:

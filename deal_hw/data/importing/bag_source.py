@@ -12,12 +12,7 @@ from urllib.parse import quote
 from mcap.records import Channel, Message, Schema
 
 from deal_hw.data.importing.channels import Channels, digest_of_files
-from deal_hw.data.importing.mcap_source import MAGIC, BagMessage, channels_of, messages
-from deal_hw.data.recording.schemas import (
-    FLOAT64_MULTI_ARRAY,
-    JOINT_STATE,
-    JOINT_TRAJECTORY,
-)
+from deal_hw.data.importing.mcap_source import KNOWN, MAGIC, BagMessage, channels_of, messages
 from deal_hw.errors import DatasetError, short
 from deal_hw.reading import NAMES, RECORDING_BYTES, check_size, reading
 
@@ -25,8 +20,6 @@ SQLITE: Final = b"SQLite format 3\0"
 _SCHEMAS: Final = 1 << 16
 """Numbers of schemas that one file may have."""
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"
-_KNOWN: Final = {kind.name: kind.definition for kind in (JOINT_STATE, FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY)}
-"""Definitions for bags of ROS 2 Humble and older, which hold none."""
 _CONVERT: Final = "`ros2 bag convert` writes MCAP without compression"
 
 
@@ -92,7 +85,7 @@ def _rows(path: Path, notes: dict[str, str]) -> Iterator[BagMessage]:
         tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
             raise ValueError(f"its tables are {short(', '.join(sorted(tables)), 80)}, not those of a bag")
-        definitions = dict(_KNOWN)
+        definitions = dict(KNOWN)
         if "message_definitions" in tables:
             definitions |= {
                 str(kind): str(text)

@@ -58,11 +58,13 @@ def guess_topics(channels: Channels, joints: Sequence[str] | None = None) -> Col
     state = _only(channels, states, joints, "measured positions", "position")
     topic, array = state, states[state]
     names = list(channels.labels.get(array, ()))
-    commands = _commands(channels, array, names)
     found = match_joints(channels, names, joints)
+    commands = _commands(channels, array, names, len(found))
     command = _only(channels, commands, names, "commands", "target")
     target = commands[command]
     by_order = target not in channels.labels
+    # A controller of those of the measured joints that the model has, in their order.
+    of_some = by_order and channels.arrays[target].shape[1] < len(names)
     time, command_time = _times(channels, topic, command)
     same = channels.arrays[array].shape
     velocity, effort = (
@@ -77,8 +79,13 @@ def guess_topics(channels: Channels, joints: Sequence[str] | None = None) -> Col
         velocity=velocity,
         effort=effort,
         joints=tuple(
-            JointColumns(name=model, column=name, index=index if by_order else None)
-            for model, name, index in found
+            JointColumns(
+                name=model,
+                column=name,
+                index=index if by_order and not of_some else None,
+                target=f"{target}[{place}]" if of_some else None,
+            )
+            for place, (model, name, index) in enumerate(found)
         ),
         source=("guessed",),
     )
@@ -88,7 +95,7 @@ def _plain(kind: str) -> str:
     return kind.rpartition("/")[2]
 
 
-def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str, str]:
+def _commands(channels: Channels, state: str, names: Sequence[str], known: int) -> dict[str, str]:
     """Return the topics that may contain the commands, with their channels; of the best kind only."""
     reference: dict[str, str] = {}
     others: dict[str, str] = {}
@@ -102,7 +109,7 @@ def _commands(channels: Channels, state: str, names: Sequence[str]) -> dict[str,
             segments.append(topic)
         named = name in channels.labels and bool(set(channels.labels[name]) & set(names))
         ordered = channels.is_wide(name) and name not in channels.labels and is_target(topic)
-        fits = ordered and channels.arrays[name].shape[1] == len(names)
+        fits = ordered and channels.arrays[name].shape[1] in (len(names), known)
         if (named and name != state and (is_target(topic) or _plain(kind) != "JointState")) or fits:
             others[topic] = name
     if reference or others:

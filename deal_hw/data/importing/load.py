@@ -17,6 +17,7 @@ from deal_hw.data.importing.columns import EFFORT_UNITS, ColumnMap, JointColumns
 from deal_hw.data.importing.guess import channels_of_joints, guess_columns, guess_time
 from deal_hw.data.importing.guess_topics import guess_topics
 from deal_hw.data.importing.repeats import without_repeats
+from deal_hw.data.importing.sources import check_one_source
 from deal_hw.data.importing.stamps import on_even_clock
 from deal_hw.data.importing.table import build_table
 from deal_hw.data.recording.schemas import METADATA_NAME
@@ -138,6 +139,7 @@ def tables_of(
             asked = joints if joints is None else [name for name in joints if name not in led or name in has]
             _tell(say, channels, used, asked, mapped is None and number == 0, printed)
         table = build_table(channels, used, joints)
+        check_one_source(table)
         for fact, mended in (("repeats", without_repeats), ("stamps", on_even_clock)):
             table, text = mended(table)
             if text:

@@ -7,23 +7,22 @@ import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import lz4.frame
-import numpy as np
 import zstandard
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap_ros2.decoder import DecoderFactory
 
-from deal_hw.data.importing.channels import Channels, as_floats, digest_of_file
-from deal_hw.errors import DatasetError, short
+from deal_hw.data.importing.channels import Channels, digest_of_file
+from deal_hw.data.importing.topics import Row, channels_of_topics, is_list, named
+from deal_hw.data.recording.schemas import FLOAT64_MULTI_ARRAY, JOINT_STATE, JOINT_TRAJECTORY
+from deal_hw.errors import short
 from deal_hw.reading import MIB, NAMES, NUMBERS, RECORDING_BYTES, check_size, reading
-from deal_hw.types import FloatArray
 
 BagMessage: TypeAlias = tuple[Schema | None, Channel, Message]
-STAMP_FIELDS = ("log_time", "header.stamp")
-"""Times of each topic [s]: the recorder's time of receipt, and the sender's time."""
 MAGIC = b"\x89MCAP0\r\n"
 """First bytes of an MCAP file (mcap.dev/spec)."""
 CHUNK_BYTES = 64 * MIB
@@ -32,8 +31,8 @@ _LEAF_COST = 16
 """Additional memory of a field of a message, in numbers, beside its values."""
 LIST_BYTES = MIB
 """Largest message with a list of messages; a trajectory of ten thousand points."""
-NAME_FIELDS = ("name", "joint_names", "dof_names")
-"""Fields that name the joints of a message."""
+KNOWN: Final = {kind.name: kind.definition for kind in (JOINT_STATE, FLOAT64_MULTI_ARRAY, JOINT_TRAJECTORY)}
+"""Definitions for bags that hold none, such as those of ROS 2 Humble and older."""
 _LISTS = {
     "trajectory_msgs/JointTrajectoryPoint": [
         *[("float64", "[]")] * 4,
@@ -54,12 +53,15 @@ def read_mcap(path: Path) -> Channels:
     ``/joint_states.log_time`` and ``/joint_states.header.stamp`` (T,) [s], both on one zero. Nested fields
     are joined by dots: ``/imu.orientation.w``.
 
+    Where the messages of one topic name different joints, as of an arm and its gripper, these are merged by
+    name, with a note.
+
     A trajectory of one point gives the fields of that point (``/traj.points.positions``), one of several only
-    their number (``/traj.points.count``). Topics with other lists of messages are left out with a note. Sizes
-    are limited, see :mod:`deal_hw.reading`.
+    their number (``/traj.points.count``). Topics with other lists of messages, in other encodings than ROS
+    2's or without a definition are left out with a note. Sizes are limited, see :mod:`deal_hw.reading`.
 
     Raises:
-        DatasetError: It cannot be read, or the messages of one topic differ in their joints.
+        DatasetError: It cannot be read.
     """
     path = Path(path)
     with reading(path, "MCAP with ROS 2 messages", "if it is incomplete, `mcap recover` repairs it"):
@@ -86,49 +88,32 @@ def channels_of(
         bag: Its messages, each with schema and channel.
         left_out: Topics whose messages are not in ``bag``, and why; it may grow as that is read.
     """
-    topics: dict[str, list[dict[str, Any]]] = {}
+    topics: dict[str, list[Row]] = {}
+    known: dict[str, Schema | None] = {}
     types: dict[str, str] = {}
     factory = DecoderFactory()
     notes: dict[str, str] = {}
     budget = NUMBERS
     for schema, channel, message in bag:
         if channel.topic not in notes:
-            notes[channel.topic] = _reason_to_leave_out(schema)
+            notes[channel.topic], known[channel.topic] = _readable(channel, schema, factory)
             types[channel.topic] = "" if schema is None else schema.name
         if notes[channel.topic]:
             continue
-        decode = factory.decoder_for(channel.message_encoding, schema)
+        definition = known[channel.topic]
+        decode = factory.decoder_for(channel.message_encoding, definition)
         if decode is None:
-            raise ValueError(
-                f"{short(channel.topic)} is not in ROS 2's encoding, but {channel.message_encoding}"
-            )
-        if len(message.data) > LIST_BYTES and _has_lists(schema):
+            raise ValueError(f"the messages on {short(channel.topic)} change their encoding")
+        if len(message.data) > LIST_BYTES and _has_lists(definition):
             raise ValueError(f"a message of more than {LIST_BYTES / MIB:g} MiB on {short(channel.topic)}")
         row = dict(_fields(decode(message.data)))
         row["log_time"] = message.log_time
-        row["name"] = next((row[field] for field in NAME_FIELDS if field in row), ())
-        budget -= sum(_LEAF_COST + (len(v) if _is_list(v) else 0) for v in row.values())
+        row["name"] = named(row)
+        budget -= sum(_LEAF_COST + (len(v) if is_list(v) else 0) for v in row.values())
         if budget < 0:
             raise ValueError(f"more than {NUMBERS} numbers; keep the joints' topics (`mcap filter`)")
         topics.setdefault(channel.topic, []).append(row)
-    for rows in topics.values():
-        rows.sort(key=lambda row: int(row["log_time"]))
-    arrays: dict[str, FloatArray] = {}
-    labels: dict[str, tuple[str, ...]] = {}
-    zero_ns = _first_stamp(topics)
-    for topic, rows in topics.items():
-        names = _names(path, topic, rows)
-        for field in rows[0]:
-            values = _channel(rows, field, names, zero_ns)
-            if values is not None:
-                arrays[f"{topic}.{field}"] = values
-                if names and values.ndim == 2 and values.shape[1] == len(names):
-                    labels[f"{topic}.{field}"] = names
-    reasons = {**(left_out or {}), **notes}
-    said = tuple(f"{short(topic, 60)} is left out: {why}" for topic, why in reasons.items() if why)
-    return Channels(
-        path=path, kind="mcap", digest=digest, arrays=arrays, labels=labels, types=types, notes=said
-    )
+    return channels_of_topics(path, "mcap", digest, topics, types, {**(left_out or {}), **notes})
 
 
 def messages(path: Path) -> Iterator[BagMessage]:
@@ -165,14 +150,32 @@ def _unpacked(chunk: Chunk) -> Chunk:
     return dataclasses.replace(chunk, compression="", data=data)
 
 
-def _reason_to_leave_out(schema: Schema | None) -> str:
-    """Return why messages of a schema are not decoded; "" if they are.
+def _readable(channel: Channel, schema: Schema | None, factory: DecoderFactory) -> tuple[str, Schema | None]:
+    """Return why messages of a topic are not decoded, "" if they are, and what to decode them by."""
+    if channel.message_encoding != MessageEncoding.CDR:
+        return f"its messages are {short(channel.message_encoding, 40)}, not in ROS 2's CDR", None
+    if schema is not None and not schema.data and schema.name in KNOWN:
+        schema = dataclasses.replace(schema, data=KNOWN[schema.name].encode(), encoding=SchemaEncoding.ROS2)
+    if schema is None or not schema.data:
+        kind = "its messages" if schema is None else short(schema.name, 60)
+        return f"the bag holds no definition of {kind}", None
+    if schema.encoding != SchemaEncoding.ROS2:
+        return f"its definition is {short(schema.encoding, 40)}, not {SchemaEncoding.ROS2}", None
+    if reason := _costs(schema):
+        return reason, None
+    try:
+        factory.decoder_for(channel.message_encoding, schema)
+    except Exception as error:
+        return f"its definition cannot be understood: {short(error, 80)}", None
+    return "", schema
+
+
+def _costs(schema: Schema) -> str:
+    """Return why messages of a schema may take more time or memory than they have bytes; "" if they do not.
 
     The decoder follows the schema alone. A list of empty messages may have four thousand million entries, and
     messages that contain another one twice double with each level, both without a byte of data.
     """
-    if schema is None:
-        return ""
     parts = _SCHEMA_PART.split(schema.data.decode("utf-8"))
     fields = {
         name.replace("/msg/", "/"): _SCHEMA_FIELD.findall(text)
@@ -181,11 +184,11 @@ def _reason_to_leave_out(schema: Schema | None) -> str:
     open_, count = [schema.name.replace("/msg/", "/")], 0
     while open_:
         package = open_[-1].partition("/")[0]
-        for kind, is_list in fields.get(open_.pop(), ()):
+        for kind, brackets in fields.get(open_.pop(), ()):
             full = kind if "/" in kind else f"{package}/{kind}"
             if full.replace("/msg/", "/") in fields:
-                if is_list and fields[full.replace("/msg/", "/")] != _LISTS.get(full.replace("/msg/", "/")):
-                    return f"{kind}{is_list} is a list of messages"
+                if brackets and fields[full.replace("/msg/", "/")] != _LISTS.get(full.replace("/msg/", "/")):
+                    return f"{kind}{brackets} is a list of messages"
                 open_.append(full.replace("/msg/", "/"))
             count += 1
             if count > NAMES:
@@ -208,63 +211,9 @@ def _fields(message: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
                 yield name, int(value.sec) * 10**9 + int(value.nanosec)
             else:
                 yield from _fields(value, f"{name}.")
-        elif isinstance(value, (bool, int, float)) or _is_list(value):
+        elif isinstance(value, (bool, int, float)) or is_list(value):
             yield name, value
         elif isinstance(value, list) and hasattr(value[0], "__slots__"):
             yield f"{name}.count", len(value)
             if len(value) == 1:
                 yield from _fields(value[0], f"{name}.")
-
-
-def _is_list(value: Any) -> bool:
-    if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
-        return False
-    return len(value) == 0 or isinstance(value[0], (int, float, str, np.number))
-
-
-def _first_stamp(topics: dict[str, list[dict[str, Any]]]) -> int:
-    """Return the earliest stamp in the file [ns], the zero of all.
-
-    It is subtracted in integers, since absolute nanoseconds would lose their last digits as floats.
-    """
-    every = (row for rows in topics.values() for row in rows)
-    return min((row[kind] for row in every for kind in STAMP_FIELDS if row.get(kind, 0) > 0), default=0)
-
-
-def _names(path: Path, topic: str, rows: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Return the joints of a topic in the order of its first message; () if it names none."""
-    first: Any = rows[0]["name"]
-    if not _is_list(first) or not all(isinstance(name, str) for name in first):
-        return ()
-    names = tuple(first)
-    for number, row in enumerate(rows):
-        if set(row["name"]) != set(names):
-            raise DatasetError(
-                f"{path}: message {number} on {topic} names the joints {sorted(row['name'])}, but the "
-                f"first one {sorted(names)}; record each publisher on its own topic"
-            )
-    return names
-
-
-def _channel(
-    rows: list[dict[str, Any]], field: str, names: tuple[str, ...], zero_ns: int
-) -> FloatArray | None:
-    """Return one field of all messages, (T,) or (T, K); None if it is not numbers of one length."""
-    if field in STAMP_FIELDS:
-        stamps = np.array([row[field] for row in rows], dtype=np.int64) - zero_ns
-        return stamps.astype(np.float64) * 1e-9
-    values: list[Any] = [row.get(field) for row in rows]
-    if any(value is None for value in values):
-        return None
-    if not _is_list(values[0]):
-        return as_floats(values)
-    sizes = {len(value) for value in values}
-    if len(sizes) != 1 or 0 in sizes or isinstance(values[0][0], str):
-        return None
-    table = as_floats(values)
-    if names and table.shape[1] == len(names):
-        for number, row in enumerate(rows):
-            if tuple(row["name"]) != names:
-                order = [list(row["name"]).index(name) for name in names]
-                table[number] = table[number, order]
-    return table

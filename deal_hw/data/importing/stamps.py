@@ -44,8 +44,8 @@ def even_counts(clock: FloatArray) -> tuple[IntArray, float]:
     pause = steps > GAP_PERIODS * median
     part = np.concatenate(([0], np.cumsum(pause)))
     found = []
-    for counts in (np.maximum(np.round(steps / median), 1), np.ones(len(steps))):
-        counts = np.where(pause, 0, counts).astype(np.int64)
+    for each in (np.maximum(np.round(steps / median), 1), np.ones(len(steps))):
+        counts: IntArray = np.where(pause, 0, each).astype(np.int64)
         number = np.concatenate(([0.0], np.cumsum(counts)))
         along, times = number - _means(number, part), clock - _means(clock, part)
         period = float(along @ times / (along @ along)) if along.any() else median
