@@ -14,8 +14,8 @@ from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.model import load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.mjcf.exports import urdf_values
+from deal_hw.sim.parameters.default_space import default_space
 from deal_hw.sim.parameters.followers import followers_of, natural_followers
-from deal_hw.sim.parameters.template import default_space
 from deal_hw.sim.robots.user_robot import derive_robot, read_robot
 from deal_hw.types import FloatArray
 from deal_hw.workflows.import_export import ImportSettings, import_recordings

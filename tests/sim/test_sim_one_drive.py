@@ -18,9 +18,9 @@ from deal_hw.sim.mjcf.calibrated import write_calibrated_mjcf
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.mjcf.joint_facts import joint_facts
 from deal_hw.sim.parameters import check_space
+from deal_hw.sim.parameters.default_space import default_space
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.parameters.one_drive import gather, scatter
-from deal_hw.sim.parameters.template import default_space
 from deal_hw.types import FloatArray
 
 ARM = """<mujoco>
@@ -97,9 +97,10 @@ def test_the_drive_has_all_of_it(case: str, limit: float, damping: float, tmp_pa
     """One servo a joint, with the limit of the joint and the damping of both actuators, at the joint."""
     one = robot(tmp_path, CASES[case])
     drive = drive_of(one.model, one.actuator[0], "p")
-    assert (drive.takes, drive.effort_limit) == ("position", pytest.approx(limit))
+    assert drive.takes == "position"
+    assert drive.effort_limit == pytest.approx(limit)
     assert drive.damping == pytest.approx(damping)
-    assert one.description.effort_limit == (pytest.approx(limit),)
+    assert list(one.description.effort_limit) == pytest.approx([limit])
     facts = joint_facts(one.description.mjcf)
     assert facts.servo.all() and not facts.motor.any()
 

@@ -17,7 +17,7 @@ from deal_hw.sim.laws.setpoints import delay
 from deal_hw.sim.mjcf.calibrated import custom_latency_s, write_calibrated_mjcf
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.mjcf.plain import write_plain_mjcf
-from deal_hw.sim.parameters.template import default_space
+from deal_hw.sim.parameters.default_space import default_space
 from deal_hw.types import FloatArray
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
 
