@@ -11,7 +11,7 @@ import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from deal_hw.calib.data.noise import (
     smooth_states,
     white_noise_std,
 )
+from deal_hw.calib.data.population_policy import PopulationPolicy
 from deal_hw.calibration import LATENCY, LATENCY_RANGE_S
 from deal_hw.description import EFFORT_UNITS
 from deal_hw.errors import ConfigurationError, InsufficientDataError
@@ -149,37 +150,6 @@ class MemberPrediction:
     observed: FloatArray
     position: FloatArray
     velocity: FloatArray
-
-
-class PopulationPolicy(Protocol):
-    """pi_0, the policy that produced all commands of the recordings, for N simulators at once.
-
-    A shallow copy that was started again is independent: each thread has its own.
-    """
-
-    @property
-    def history(self) -> int:
-        """Length of its memory [control periods]."""
-        ...
-
-    @property
-    def ran_before(self) -> bool:
-        """Whether it ran before the recordings began; if not, their first command is its first."""
-        ...
-
-    def restart(
-        self, count: int, position: FloatArray, velocity: FloatArray, command: FloatArray, number: int
-    ) -> None:
-        """Start N simulators, ``count``, from one common past.
-
-        Past states are (h, C), oldest first, the policy's commands in them (h, A). ``number`` counts its
-        commands so far; at least h.
-        """
-        ...
-
-    def __call__(self, position: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the commands of the next control period, (N, A), from positions and velocities, (N, C)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

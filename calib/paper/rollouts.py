@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.innovations import Members, early_setpoints
-from deal_hw.calib.data.problem import PopulationPolicy, Problem
+from deal_hw.calib.data.population_policy import PopulationPolicy
+from deal_hw.calib.data.problem import Problem
 from deal_hw.errors import InsufficientDataError
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.closed_loop import ClosedLoop, on_physics_steps

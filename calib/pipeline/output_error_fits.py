@@ -48,12 +48,11 @@ from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, at_parameters
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits, Refinement
-from deal_hw.calib.pipeline.wider_ranges import MOST
+from deal_hw.calib.pipeline.wider_ranges import fit_beyond_ends
 from deal_hw.calib.search.no_data import nominal
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Z90, Budget, CalibrationMethod, CalibrationResult
 from deal_hw.errors import InsufficientDataError
-from deal_hw.sim.parameters import wider
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import joined, spread, stretches
 from deal_hw.task_map import InThisProcess
@@ -567,25 +566,6 @@ def _fold_masks(problem: Problem) -> Sequence[Sequence[Mask]]:
 def _say_fold(run: CalibrationRun, folds: int, fold: int, law: str = "") -> None:
     question = f"does {law} predict it better?" if law else "which fit predicts unseen data best?"
     run.say("cross-validation", f"{fold + 1} of {folds}: {question}")
-
-
-def fit_beyond_ends(problem: Problem, start: Member, recipe: Recipe) -> OutputErrorFit:
-    """Fit from a start; where it ends at an end of a range that nobody chose, again in a wider one.
-
-    Only parameters whose expected value holds them go on there. Nothing else would end such a fit, since its
-    residual scale says that the model is wrong.
-    """
-    fit = fit_output_error(problem, *start, recipe)
-    for _ in range(MOST):
-        held = {p.name for p in problem.space if p.prior_std is not None}
-        ends = dict(zip(problem.space.names, np.sign(problem.space.normalize(fit.theta) - 0.5), strict=True))
-        at_end = held.intersection(names_at_bound(problem.space, fit.theta), problem.guessed)
-        wide = wider(problem.space, {name: int(ends[name]) for name in sorted(at_end)})
-        if wide.to_json() == problem.space.to_json():
-            break
-        problem = problem.with_space(wide)
-        fit = fit_output_error(problem, *fit.member, recipe)
-    return fit
 
 
 def _joined_stretches(problem: Problem) -> Problem:

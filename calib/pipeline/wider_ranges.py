@@ -10,8 +10,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
 
-from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import latency_end, pressed_ends, wider_latency
+import numpy as np
+
+from deal_hw.calib.data.problem import Member, Problem
+from deal_hw.calib.fit.intervals import latency_end, names_at_bound, pressed_ends, wider_latency
+from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.minima import clearly_lower
@@ -86,6 +89,25 @@ def with_wider_ranges(run: CalibrationRun, fit: Refined, again: Again) -> tuple[
             f"ranges: {listed(ranges)}. If such values are impossible, give a range ({_options(grown)})",
         )
     return run, fit
+
+
+def fit_beyond_ends(problem: Problem, start: Member, recipe: Recipe) -> OutputErrorFit:
+    """Fit from a start; where it ends at an end of a range that nobody chose, again in a wider one.
+
+    Only parameters whose expected value holds them go on there. Nothing else would end such a fit, since its
+    residual scale says that the model is wrong.
+    """
+    fit = fit_output_error(problem, *start, recipe)
+    for _ in range(MOST):
+        held = {p.name for p in problem.space if p.prior_std is not None}
+        ends = dict(zip(problem.space.names, np.sign(problem.space.normalize(fit.theta) - 0.5), strict=True))
+        at_end = held.intersection(names_at_bound(problem.space, fit.theta), problem.guessed)
+        wide = wider(problem.space, {name: int(ends[name]) for name in sorted(at_end)})
+        if wide.to_json() == problem.space.to_json():
+            break
+        problem = problem.with_space(wide)
+        fit = fit_output_error(problem, *fit.member, recipe)
+    return fit
 
 
 def _text(problem: Problem, name: str, low: float, high: float) -> str:

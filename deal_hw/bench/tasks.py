@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from deal_hw.bench.scores import check_truth
-from deal_hw.calib.data.problem import PopulationPolicy
+from deal_hw.calib.data.population_policy import PopulationPolicy
 from deal_hw.description import RobotDescription
 from deal_hw.drivers.cartpole.description import DESCRIPTION, SPACES
 from deal_hw.drivers.cartpole.emulator.oracle import draw_truth

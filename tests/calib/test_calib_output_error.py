@@ -28,10 +28,10 @@ from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.output_error_fits import (
     OutputErrorFits,
     OutputErrorSettings,
-    fit_beyond_ends,
     output_error_method,
 )
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
+from deal_hw.calib.pipeline.wider_ranges import fit_beyond_ends
 from deal_hw.calib.search.eki import Eki
 from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.settings import Validation

@@ -38,7 +38,7 @@ from deal_hw.workflows.calibration.space import without_idle_limits
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
-    from deal_hw.calib.data.problem import PopulationPolicy
+    from deal_hw.calib.data.population_policy import PopulationPolicy
     from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.episode import SampledEpisode

@@ -10,7 +10,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.types import Trajectory
 
 if TYPE_CHECKING:
-    from deal_hw.calib.data.problem import PopulationPolicy
+    from deal_hw.calib.data.population_policy import PopulationPolicy
     from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
     from deal_hw.sim.recordings.setups import Setups
