@@ -319,7 +319,7 @@ def alarms() -> list[tuple[str, ...]]:
 
 def alarms_page() -> str:
     """Return the page of alarms, causes of an unexplained residual behind them."""
-    from deal_hw.calib.validation.cause_words import LOOKS
+    from deal_hw.calib.hypotheses.cause_words import LOOKS
 
     lines = [
         "# Alarms",

@@ -21,7 +21,7 @@ from deal_hw.calib.pipeline.own_zeros import with_own_zeros
 from deal_hw.calibration import BEFORE_SEARCH, CalibrationResult
 
 if TYPE_CHECKING:
-    from deal_hw.calib.validation.explain import Explained
+    from deal_hw.calib.hypotheses.trials import Explained
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -116,7 +116,7 @@ def with_limits(run: CalibrationRun, local: Refined) -> FitOutcome | Calibration
 
     Each robot has them, so no law is asked where they leave only noise.
     """
-    from deal_hw.calib.validation.explain import try_limits
+    from deal_hw.calib.hypotheses.trials import try_limits
 
     with run.check(EXPLANATIONS):
         tried = try_limits(run.problem, run.may_try, run.ask)
@@ -128,7 +128,7 @@ def with_laws(run: CalibrationRun, local: Refined) -> FitOutcome | CalibrationRu
 
     Around a poor fit only play and what is 0 are fitted; see `try_explanations`.
     """
-    from deal_hw.calib.validation.explain import try_explanations
+    from deal_hw.calib.hypotheses.trials import try_explanations
 
     if run.settings.diagnosis:
         with run.check(EXPLANATIONS):
@@ -142,9 +142,9 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
 
     No search follows: nothing but noise is left to explain. ``searched`` is the result of an earlier one.
     """
-    from deal_hw.calib.validation.candidates import law_candidates, ranked
+    from deal_hw.calib.hypotheses.candidates import law_candidates, ranked
+    from deal_hw.calib.hypotheses.trials import explained, rivals
     from deal_hw.calib.validation.checks import hold_alike
-    from deal_hw.calib.validation.explain import explained, rivals
 
     tried = [one for one in run.tried if run.takes(one.explanation)]
     if run.local is None or not tried:
@@ -194,8 +194,8 @@ def with_random_delays(run: CalibrationRun, local: Refined) -> FitOutcome | Cali
 
     Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
     """
+    from deal_hw.calib.hypotheses.trials import FAR
     from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
-    from deal_hw.calib.validation.explain import FAR
 
     if local.chi2 > FAR:
         return run

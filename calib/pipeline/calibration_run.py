@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.intervals import Uncertainty
     from deal_hw.calib.fit.output_error import OutputErrorFit
     from deal_hw.calib.fit.refinement import Refined
-    from deal_hw.calib.validation.candidates import Candidate
-    from deal_hw.calib.validation.cause_words import Diagnosis
-    from deal_hw.calib.validation.explain import Tried
-    from deal_hw.calib.validation.explanations import Explanation
-    from deal_hw.calib.validation.random_delay import DelaysAsked
-    from deal_hw.calib.validation.shared_errors import SharedErrorCheck
+    from deal_hw.calib.hypotheses.candidates import Candidate
+    from deal_hw.calib.hypotheses.cause_words import Diagnosis
+    from deal_hw.calib.hypotheses.laws import Explanation
+    from deal_hw.calib.hypotheses.random_delay import DelaysAsked
+    from deal_hw.calib.hypotheses.shared_errors import SharedErrorCheck
+    from deal_hw.calib.hypotheses.trials import Tried
 
 SHARED_ERRORS = "errors that commands and measurements share"
 EXPLANATIONS = "laws that the model lacks"
@@ -167,7 +167,7 @@ class CalibrationRun:
 
     def shared_error(self) -> SharedErrorCheck:
         """Return what was found of errors that commands and measurements share; it is looked for once."""
-        from deal_hw.calib.validation.shared_errors import find_shared_error
+        from deal_hw.calib.hypotheses.shared_errors import find_shared_error
 
         if not self.shared:
             # A wrong recording is worse than a law that is missing, so the laws that were tried take none of
@@ -180,7 +180,7 @@ class CalibrationRun:
 
     def random_delays(self, fit: Refined) -> DelaysAsked:
         """Return what a fit says of random delays of commands; each fit is asked once."""
-        from deal_hw.calib.validation.random_delay import fit_delays
+        from deal_hw.calib.hypotheses.random_delay import fit_delays
 
         for before, found in self.delays:
             same = before.shooting.problem is fit.shooting.problem

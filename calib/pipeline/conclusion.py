@@ -21,9 +21,9 @@ from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, Fi
 from deal_hw.calibration import Budget, CalibrationResult
 
 if TYPE_CHECKING:
+    from deal_hw.calib.hypotheses.random_delay import DelaysAsked
+    from deal_hw.calib.hypotheses.random_errors import ErrorFit
     from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
-    from deal_hw.calib.validation.random_delay import DelaysAsked
-    from deal_hw.calib.validation.random_errors import ErrorFit
 
 # What follows a fit is imported where it is used: until the first fit nothing of it is loaded.
 
@@ -167,7 +167,7 @@ class _Allowed:
 
     def said(self, outcome: FitOutcome) -> FitOutcome:
         """Return the result with delays, laws and random errors among its alarms and candidates."""
-        from deal_hw.calib.validation.candidates import Candidate
+        from deal_hw.calib.hypotheses.candidates import Candidate
 
         if self.errors is not None:
             shares = self.errors.errors.shares
@@ -195,9 +195,9 @@ def _allowed(
     late: LawsOnDelays | None,
 ) -> _Allowed:
     """Return the fit that allows for what the residual of another one shows; see :func:`conclude_fit`."""
+    from deal_hw.calib.hypotheses.random_errors import fit_errors
     from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
     from deal_hw.calib.validation.checks import unexplained
-    from deal_hw.calib.validation.random_errors import fit_errors
 
     found = _Allowed(run, run.problem, refined, refined, refined)
     if late is None and (_jitters(run) or unexplained(refined, WHITE_SAMPLES)):

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from deal_hw.calib.data.folds import Choice, fold_masks
 from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Member, Problem
@@ -31,14 +32,13 @@ from deal_hw.calib.fit.output_error import (
     prediction_rmse,
 )
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
+from deal_hw.calib.hypotheses.candidates import Candidate, Judged, Outcome, ranked
+from deal_hw.calib.hypotheses.laws import LAG, Explanation, values_in_words
+from deal_hw.calib.hypotheses.trials import RIVAL, applicable
+from deal_hw.calib.hypotheses.wider_models import NOTICED
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import conclusive, refined_from
-from deal_hw.calib.validation.candidates import Candidate, Judged, Outcome, ranked
-from deal_hw.calib.validation.cross_validation import Choice, fold_masks
-from deal_hw.calib.validation.explain import RIVAL, applicable
-from deal_hw.calib.validation.explanations import LAG, Explanation, values_in_words
-from deal_hw.calib.validation.wider_models import NOTICED
 from deal_hw.calibration import LATENCY, CalibrationResult, percent
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding

@@ -18,13 +18,10 @@ import numpy as np
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
-from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
-from deal_hw.calib.validation.candidates import Candidate
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.checks import with_unsure
-from deal_hw.calib.validation.evidence import Evidence, evidence, unsure_shift
-from deal_hw.calib.validation.explain import FAR, Allows, applicable, screened, screened_effect, screened_gain
-from deal_hw.calib.validation.explanations import (
+from deal_hw.calib.hypotheses.candidates import Candidate
+from deal_hw.calib.hypotheses.cause_words import Diagnosis
+from deal_hw.calib.hypotheses.evidence import Evidence, evidence, unsure_shift
+from deal_hw.calib.hypotheses.laws import (
     ZERO_CAUSES,
     Explanation,
     one_sided,
@@ -32,15 +29,18 @@ from deal_hw.calib.validation.explanations import (
     tried_value,
     values_in_words,
 )
-from deal_hw.calib.validation.signatures import Signature
-from deal_hw.calib.validation.wider_models import WiderFit, wider_cost
+from deal_hw.calib.hypotheses.signatures import Signature
+from deal_hw.calib.hypotheses.trials import FAR, Allows, applicable, screened, screened_effect, screened_gain
+from deal_hw.calib.hypotheses.wider_models import WiderFit, wider_cost
+from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
+from deal_hw.calib.validation.checks import with_unsure
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
-    from deal_hw.calib.validation.random_delay import DelayFit
+    from deal_hw.calib.hypotheses.random_delay import DelayFit
 
 MOST_LAWS = 2
 """Most laws on top of the delays."""
@@ -55,7 +55,7 @@ class LawsOnDelays:
         late: The fit, with linearised residuals.
         laws: The laws, as causes, by their names.
         unsure: Standard deviation of what laws that gain no more than chance may have moved, (K + 1,); see
-            :func:`~deal_hw.calib.validation.evidence.unsure_shift`. Empty for none.
+            :func:`~deal_hw.calib.hypotheses.evidence.unsure_shift`. Empty for none.
     """
 
     run: CalibrationRun

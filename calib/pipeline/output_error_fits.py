@@ -59,12 +59,12 @@ from deal_hw.task_map import InThisProcess
 from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
+    from deal_hw.calib.data.folds import Choice
     from deal_hw.calib.data.noise import Mask
+    from deal_hw.calib.hypotheses.candidates import Diagnosed
+    from deal_hw.calib.hypotheses.trials import Allows
     from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice
-    from deal_hw.calib.validation.candidates import Diagnosed
     from deal_hw.calib.validation.checks import SplitHalf
-    from deal_hw.calib.validation.cross_validation import Choice
-    from deal_hw.calib.validation.explain import Allows
 
 # What follows the fits is imported where it is used, as in stages.py.
 
@@ -178,6 +178,11 @@ class OutputErrorFits(Fits):
 
     def best(self, run: CalibrationRun) -> FitOutcome:
         """Search, fit all candidates, take the best predictor. See :meth:`Fits.best`."""
+        from deal_hw.calib.data.folds import Choice
+        from deal_hw.calib.hypotheses.candidates import ranked
+        from deal_hw.calib.hypotheses.diagnosis import diagnose
+        from deal_hw.calib.hypotheses.laws import EXPLANATIONS
+        from deal_hw.calib.hypotheses.trials import FAR, refused
         from deal_hw.calib.pipeline.law_choice import (
             LawfulChoice,
             ScreenedLaws,
@@ -186,11 +191,6 @@ class OutputErrorFits(Fits):
             take_laws,
         )
         from deal_hw.calib.validation import checks
-        from deal_hw.calib.validation.candidates import ranked
-        from deal_hw.calib.validation.cross_validation import Choice
-        from deal_hw.calib.validation.diagnosis import diagnose
-        from deal_hw.calib.validation.explain import FAR, refused
-        from deal_hw.calib.validation.explanations import EXPLANATIONS
 
         settings, (first, *windows) = self.settings, self.first or self.started(run).first
         # The recordings as they are fitted, which may be joined or a part, in ranges that may have grown.
@@ -346,8 +346,8 @@ class OutputErrorFits(Fits):
         ends in it whatever its start. Without ``search``, that on all recordings was no better start, and no
         fold is searched. Fits with laws follow, as long as they predict better than all without.
         """
+        from deal_hw.calib.data.folds import on_folds
         from deal_hw.calib.pipeline.law_choice import LawfulChoice
-        from deal_hw.calib.validation.cross_validation import on_folds
 
         settings, before = self.settings, problem.steps
         masks = _fold_masks(problem)
@@ -441,8 +441,8 @@ class OutputErrorFits(Fits):
         self, run: CalibrationRun, problem: Problem, fit: OutputErrorFit, recipe: Recipe, known: Uncertainty
     ) -> SplitHalf:
         """Fit two halves of the motions from the estimate on all data, and compare."""
+        from deal_hw.calib.data.folds import fold_masks
         from deal_hw.calib.validation.checks import HALVES, SplitHalf, agreement
-        from deal_hw.calib.validation.cross_validation import fold_masks
 
         before, values = problem.steps, 1 + len(problem.space) / problem.independent
         # Derivatives by each value and the latency, each with its steps; central ones at the end.
@@ -557,7 +557,7 @@ def _including(known: Uncertainty, other: FloatArray) -> Uncertainty:
 
 def _fold_masks(problem: Problem) -> Sequence[Sequence[Mask]]:
     """Return the samples of each recording that each fold leaves out; a single motion is split in time."""
-    from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
+    from deal_hw.calib.data.folds import fold_masks, motion_numbers, time_masks
 
     motions = motion_numbers(problem.episodes)[-1] + 1
     return time_masks(problem, FOLDS) if motions == 1 else fold_masks(problem, min(motions, FOLDS))

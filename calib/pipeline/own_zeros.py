@@ -25,7 +25,7 @@ COMMON_ZEROS = "another zero of the encoders"
 """Name of the candidate with one zero for all recordings."""
 
 if TYPE_CHECKING:
-    from deal_hw.calib.validation.evidence import Evidence
+    from deal_hw.calib.hypotheses.evidence import Evidence
 
 
 def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | CalibrationRun:
@@ -41,14 +41,14 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | Calibrat
         run: The calibration.
         local: Its local fit.
     """
-    from deal_hw.calib.validation.candidates import Candidate
-    from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis
-    from deal_hw.calib.validation.diagnosis import POOR
-    from deal_hw.calib.validation.evidence import evidence
-    from deal_hw.calib.validation.explain import DECISIVE
-    from deal_hw.calib.validation.recording_zeros import common_zeros, named_zeros, own_zeros, zeros_of
-    from deal_hw.calib.validation.signatures import zeros
-    from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost
+    from deal_hw.calib.hypotheses.candidates import Candidate
+    from deal_hw.calib.hypotheses.cause_words import LOOKS, Diagnosis
+    from deal_hw.calib.hypotheses.diagnosis import POOR
+    from deal_hw.calib.hypotheses.evidence import evidence
+    from deal_hw.calib.hypotheses.recording_zeros import common_zeros, named_zeros, own_zeros, zeros_of
+    from deal_hw.calib.hypotheses.signatures import zeros
+    from deal_hw.calib.hypotheses.trials import DECISIVE
+    from deal_hw.calib.hypotheses.wider_models import fit_wider, gain_of, wider_cost
 
     problem, names = run.problem, recordings_of(e.name for e in run.problem.episodes)
     shared = [] if problem.noise_free else zeros(problem)

@@ -269,8 +269,8 @@ def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
 
     The local fit may be in another minimum, around which other laws gain.
     """
+    from deal_hw.calib.hypotheses.trials import applicable, of_masses, try_explanations
     from deal_hw.calib.validation.checks import unexplained
-    from deal_hw.calib.validation.explain import applicable, of_masses, try_explanations
 
     takes = run.settings.laws or of_masses(run.problem) or any(e.in_mjcf for e in applicable(run.problem))
     if not (run.settings.diagnosis and takes and unexplained(refined)):
@@ -289,7 +289,7 @@ def far_from_noise(run: CalibrationRun, refined: Refined) -> bool:
     Where folds over the motions are asked for, the fit that predicts best is then better than the one that
     explains most. A free base has its own windows (`gait`), and a given residual scale its own meaning.
     """
-    from deal_hw.calib.validation.explain import FAR
+    from deal_hw.calib.hypotheses.trials import FAR
 
     problem = run.problem
     known = problem.known_std is not None or problem.noise_free
@@ -308,8 +308,8 @@ def best_of(fits: Fits, run: CalibrationRun) -> FitOutcome:
 
     Far from the noise delays would explain what no parameters there do.
     """
+    from deal_hw.calib.hypotheses.trials import FAR
     from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
-    from deal_hw.calib.validation.explain import FAR
 
     found, local = fits.best(run), run.local
     if not run.settings.diagnosis or local is None or local.chi2 > FAR:

@@ -12,7 +12,7 @@ import numpy as np
 from deal_hw.calib.data.innovations import Members, whitened_residual
 from deal_hw.calib.data.parts import longest_windows, samples_in
 from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
-from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros
+from deal_hw.calib.hypotheses.recording_zeros import fitted_zeros, with_other_zeros
 from deal_hw.calib.validation.residual_place import quantities, size_over
 from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import InsufficientDataError

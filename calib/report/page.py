@@ -17,10 +17,10 @@ import numpy as np
 from markupsafe import Markup
 
 from deal_hw.calib.fit.intervals import EVIDENCE
+from deal_hw.calib.hypotheses.recording_zeros import next_zeros
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.verdict import grouped, make_story, trust
-from deal_hw.calib.validation.recording_zeros import next_zeros
 from deal_hw.calibration import RESULT_FILE, CalibrationResult, percent, std_words
 from deal_hw.data.files import published_together, write_json
 from deal_hw.errors import ConfigurationError, DatasetError, ModelNotWrittenError
@@ -273,7 +273,7 @@ def compared_fits(choice: Mapping[str, Any]) -> list[ComparedFit]:
     """Return the candidates of a cross-validation, best first; nothing where none were compared.
 
     Args:
-        choice: :meth:`deal_hw.calib.validation.cross_validation.Choice.to_json`.
+        choice: :meth:`deal_hw.calib.data.folds.Choice.to_json`.
     """
     errors, chosen = _mapping(choice.get("errors")), choice.get("chosen")
     if chosen not in errors:
@@ -309,7 +309,7 @@ def candidate_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the table of candidate explanations, in words.
 
     Args:
-        found: :meth:`deal_hw.calib.validation.candidates.Candidate.to_json` of each.
+        found: :meth:`deal_hw.calib.hypotheses.candidates.Candidate.to_json` of each.
     """
     return [
         {

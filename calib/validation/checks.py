@@ -33,9 +33,9 @@ from deal_hw.calib.fit.one_step import of_rows, one_step
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine_windows, refined_at
 from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
 from deal_hw.calib.fit.unexplained import Unexplained
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
-from deal_hw.calib.validation.explain import Allows, Tried
+from deal_hw.calib.hypotheses.cause_words import Diagnosis
+from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
+from deal_hw.calib.hypotheses.trials import Allows, Tried
 from deal_hw.calib.validation.residual_place import residual_place
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calib.validation.time_steps import check_step, counted, step_alarm

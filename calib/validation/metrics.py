@@ -12,7 +12,7 @@ import numpy as np
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.refinement import at_parameters
-from deal_hw.calib.validation.recording_zeros import fitted_zeros, with_other_zeros, zeros_of
+from deal_hw.calib.hypotheses.recording_zeros import fitted_zeros, with_other_zeros, zeros_of
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import RobotModel
 from deal_hw.sim.engine.tangent_coordinates import to_quaternion, to_vector

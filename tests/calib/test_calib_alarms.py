@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import deal_hw.calib
-from deal_hw.calib.validation.cause_words import LOOKS
+from deal_hw.calib.hypotheses.cause_words import LOOKS
 from deal_hw.calibration import CalibrationResult, listed
 from deal_hw.errors import ConfigurationError
 from deal_hw.findings import Finding

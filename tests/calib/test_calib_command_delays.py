@@ -31,13 +31,13 @@ from deal_hw.calib.fit.command_delays import (
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import STAGES_S, Refined, refine
 from deal_hw.calib.fit.residual import Shooting
+from deal_hw.calib.hypotheses import random_delay as random_delay_module
+from deal_hw.calib.hypotheses.random_delay import DelaysAsked, RandomDelay, _too_many, fit_delays
+from deal_hw.calib.hypotheses.signatures import signatures
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation import random_delay as random_delay_module
-from deal_hw.calib.validation.random_delay import DelaysAsked, RandomDelay, _too_many, fit_delays
 from deal_hw.calib.validation.settings import Validation
-from deal_hw.calib.validation.signatures import signatures
 from deal_hw.calibration import Budget
 from deal_hw.drivers.cartpole.plant.profiles import PROFILES
 from deal_hw.errors import InsufficientDataError

@@ -10,6 +10,7 @@ import pytest
 from fakes.fixed_search import FixedSearch
 
 from deal_hw.bench.tasks import Case
+from deal_hw.calib.data.folds import fold_masks
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.output_error import Recipe, fit_output_error, prediction_errors
 from deal_hw.calib.fit.refinement import Refined, at_parameters
@@ -17,7 +18,6 @@ from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.fit.solver import huber_weights, kurtosis
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.validation.checks import unexplained
-from deal_hw.calib.validation.cross_validation import fold_masks
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
 

@@ -13,18 +13,27 @@ import pytest
 from fakes.knee_evidence import SAMPLES, STD, WINDOWS, knee_evidence, knee_motion, moved_by
 from fakes.plain_truth import problem_of, truth
 
+from deal_hw.calib.data.folds import fold_numbers
 from deal_hw.calib.data.parts import part_of
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation import diagnosis
-from deal_hw.calib.validation.cause_words import Diagnosis, SearchedKinds
+from deal_hw.calib.hypotheses import diagnosis
+from deal_hw.calib.hypotheses.cause_words import Diagnosis, SearchedKinds
+from deal_hw.calib.hypotheses.diagnosis import all_allowed, name_causes, unnamed_shift, weighs
+from deal_hw.calib.hypotheses.evidence import Evidence, evidence, unsure_shift
+from deal_hw.calib.hypotheses.signatures import (
+    Cause,
+    Signature,
+    held_direction,
+    masses,
+    place_in_play,
+    signatures,
+)
+from deal_hw.calib.hypotheses.trials import explained, try_explanations
+from deal_hw.calib.hypotheses.wider_models import fit_wider, zero_parameters
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes, with_unsure
-from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.diagnosis import all_allowed, name_causes, unnamed_shift, weighs
-from deal_hw.calib.validation.evidence import Evidence, evidence, unsure_shift
-from deal_hw.calib.validation.explain import explained, try_explanations
 from deal_hw.calib.validation.residual_place import (
     Kind,
     Quantity,
@@ -33,15 +42,6 @@ from deal_hw.calib.validation.residual_place import (
     quantities,
     size_over,
 )
-from deal_hw.calib.validation.signatures import (
-    Cause,
-    Signature,
-    held_direction,
-    masses,
-    place_in_play,
-    signatures,
-)
-from deal_hw.calib.validation.wider_models import fit_wider, zero_parameters
 from deal_hw.calibration import Z90
 from deal_hw.testing.plain_robots import make_robot
 from deal_hw.types import FloatArray

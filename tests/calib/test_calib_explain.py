@@ -14,9 +14,20 @@ from fakes.law_robots import SERVO, robot
 from fakes.plain_truth import problem_of, refused, truth
 from fakes.small_runs import small_run
 
+from deal_hw.calib.data.folds import Choice
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit
+from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
+from deal_hw.calib.hypotheses.laws import (
+    EXPLANATIONS,
+    off_value,
+    one_sided,
+    tried_value,
+    values_in_words,
+)
+from deal_hw.calib.hypotheses.laws import PLAY as PLAY_LAW
+from deal_hw.calib.hypotheses.trials import DECISIVE, FAR, applicable, explained, try_explanations
 from deal_hw.calib.pipeline.attempts import with_explanation
 from deal_hw.calib.pipeline.conclusion import without_search
 from deal_hw.calib.pipeline.law_choice import (
@@ -34,17 +45,6 @@ from deal_hw.calib.pipeline.stages import (
 )
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.cross_validation import Choice
-from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
-from deal_hw.calib.validation.explain import DECISIVE, FAR, applicable, explained, try_explanations
-from deal_hw.calib.validation.explanations import (
-    EXPLANATIONS,
-    off_value,
-    one_sided,
-    tried_value,
-    values_in_words,
-)
-from deal_hw.calib.validation.explanations import PLAY as PLAY_LAW
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import Budget
 from deal_hw.parameters import Parameter, ParameterSpace

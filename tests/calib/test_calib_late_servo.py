@@ -11,8 +11,8 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import refine
-from deal_hw.calib.validation.diagnosis import diagnose
-from deal_hw.calib.validation.signatures import signatures
+from deal_hw.calib.hypotheses.diagnosis import diagnose
+from deal_hw.calib.hypotheses.signatures import signatures
 from deal_hw.drivers.cartpole.chips.controller import Controller
 from deal_hw.drivers.cartpole.chips.device import CartpoleDevice
 from deal_hw.drivers.cartpole.chips.servo import Servo

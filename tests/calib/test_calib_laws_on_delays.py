@@ -15,6 +15,12 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, at_parameters
+from deal_hw.calib.hypotheses.cause_words import Diagnosis
+from deal_hw.calib.hypotheses.laws import sized, tried_value
+from deal_hw.calib.hypotheses.random_delay import DelayFit, DelaysAsked, RandomDelay
+from deal_hw.calib.hypotheses.signatures import Signature
+from deal_hw.calib.hypotheses.trials import applicable
+from deal_hw.calib.hypotheses.wider_models import WiderFit
 from deal_hw.calib.pipeline import laws_on_delays
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit, without_search
@@ -22,14 +28,8 @@ from deal_hw.calib.pipeline.laws_on_delays import LawsOnDelays
 from deal_hw.calib.pipeline.methods import usual_budget
 from deal_hw.calib.pipeline.stages import Fits, best_of
 from deal_hw.calib.validation import checks
-from deal_hw.calib.validation.cause_words import Diagnosis
 from deal_hw.calib.validation.checks import hold_windows
-from deal_hw.calib.validation.explain import applicable
-from deal_hw.calib.validation.explanations import sized, tried_value
-from deal_hw.calib.validation.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.validation.settings import Validation
-from deal_hw.calib.validation.signatures import Signature
-from deal_hw.calib.validation.wider_models import WiderFit
 from deal_hw.calibration import Budget
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter

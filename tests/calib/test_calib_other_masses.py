@@ -15,11 +15,10 @@ from fakes.small_runs import small_run
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
-from deal_hw.calib.pipeline.attempts import with_explanation
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.checks import hold_alike
-from deal_hw.calib.validation.diagnosis import all_allowed, diagnose
-from deal_hw.calib.validation.explain import (
+from deal_hw.calib.hypotheses.cause_words import Diagnosis
+from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
+from deal_hw.calib.hypotheses.laws import off_value, one_sided, other_masses, tried_value
+from deal_hw.calib.hypotheses.trials import (
     FAR,
     Explained,
     explained,
@@ -29,7 +28,8 @@ from deal_hw.calib.validation.explain import (
     rivals,
     try_explanations,
 )
-from deal_hw.calib.validation.explanations import off_value, one_sided, other_masses, tried_value
+from deal_hw.calib.pipeline.attempts import with_explanation
+from deal_hw.calib.validation.checks import hold_alike
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.baselines.least_squares import MultiStartLeastSquares, MultiStartSettings
+from deal_hw.calib.data.folds import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts, SearchCheckpoint
 from deal_hw.calib.fit.intervals import uncertainty_at
@@ -33,7 +34,6 @@ from deal_hw.calib.pipeline.output_error_fits import (
 from deal_hw.calib.pipeline.stages import CalibrationPipeline
 from deal_hw.calib.pipeline.wider_ranges import fit_beyond_ends
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation.cross_validation import fold_masks, motion_numbers, time_masks
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.parameters import ParameterSpace

@@ -11,15 +11,15 @@ from fakes.knee_evidence import PERIOD_S, SAMPLES, WINDOWS
 
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.random_errors import (
+from deal_hw.calib.hypotheses.random_delay import random_delay
+from deal_hw.calib.hypotheses.random_errors import (
     FEWEST_WINDOWS,
     Covariance,
     ErrorWindow,
     Process,
     SeenErrors,
 )
-from deal_hw.calib.validation.signatures import SignatureResponse
+from deal_hw.calib.hypotheses.signatures import SignatureResponse
 from deal_hw.types import FloatArray
 
 

@@ -14,19 +14,19 @@ from deal_hw.calib.data.problem import Problem, WindowData
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, jitter_alarm, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Shooting, WindowRows
-from deal_hw.calib.pipeline.calibration_run import CalibrationRun
-from deal_hw.calib.pipeline.conclusion import conclude_fit
-from deal_hw.calib.validation import random_errors
-from deal_hw.calib.validation.random_delay import DelaysAsked, PossibleDelays, fit_delays
-from deal_hw.calib.validation.random_errors import (
+from deal_hw.calib.hypotheses import random_errors
+from deal_hw.calib.hypotheses.random_delay import DelaysAsked, PossibleDelays, fit_delays
+from deal_hw.calib.hypotheses.random_errors import (
     ComparedErrors,
     LikelyErrors,
     SeenErrors,
     fit_errors,
     whitened_for,
 )
+from deal_hw.calib.hypotheses.signatures import SignatureResponse
+from deal_hw.calib.pipeline.calibration_run import CalibrationRun
+from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.validation.settings import Validation
-from deal_hw.calib.validation.signatures import SignatureResponse
 from deal_hw.sim.recordings.windows import Windows
 from deal_hw.types import FloatArray
 

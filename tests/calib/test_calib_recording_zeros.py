@@ -12,15 +12,15 @@ from fakes.sine_arm import MJCF, record
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.residual import Shooting
-from deal_hw.calib.validation.diagnosis import name_causes
-from deal_hw.calib.validation.recording_zeros import (
+from deal_hw.calib.hypotheses.diagnosis import name_causes
+from deal_hw.calib.hypotheses.recording_zeros import (
     MOST_ZERO,
     named_zeros,
     next_zeros,
     own_zeros,
     zeros_of,
 )
-from deal_hw.calib.validation.signatures import Signature, by_recording
+from deal_hw.calib.hypotheses.signatures import Signature, by_recording
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings

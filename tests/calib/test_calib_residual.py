@@ -13,7 +13,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import at_parameters, refine, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.explanations import EXPLANATIONS
+from deal_hw.calib.hypotheses.laws import EXPLANATIONS
 from deal_hw.calib.validation.time_steps import scan_latency
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input

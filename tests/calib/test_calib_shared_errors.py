@@ -17,6 +17,15 @@ import deal_hw
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
+from deal_hw.calib.hypotheses import shared_errors as shared_errors_module
+from deal_hw.calib.hypotheses.random_delay import DelayFit, DelaysAsked, RandomDelay
+from deal_hw.calib.hypotheses.shared_errors import (
+    ChannelChange,
+    FoundError,
+    SharedErrorCheck,
+    find_shared_error,
+    shared_errors,
+)
 from deal_hw.calib.pipeline import attempts, laws_on_delays
 from deal_hw.calib.pipeline.attempts import with_random_delays
 from deal_hw.calib.pipeline.calibration_run import SHARED_ERRORS, CalibrationRun, FitOutcome
@@ -27,17 +36,8 @@ from deal_hw.calib.pipeline.stages import (
     with_shared_error,
 )
 from deal_hw.calib.report.verdict import trust
-from deal_hw.calib.validation import shared_errors as shared_errors_module
 from deal_hw.calib.validation.checks import unexplained
-from deal_hw.calib.validation.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.validation.settings import Validation
-from deal_hw.calib.validation.shared_errors import (
-    ChannelChange,
-    FoundError,
-    SharedErrorCheck,
-    find_shared_error,
-    shared_errors,
-)
 from deal_hw.calibration import Progress
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.testing.plain_faults import Fault, SharedFault

@@ -12,10 +12,11 @@ from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import NEAR_STRETCH, Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
+from deal_hw.calib.hypotheses import diagnosis, trials
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun
 from deal_hw.calib.pipeline.stages import report_unidentifiable
 from deal_hw.calib.search.eki import Eki
-from deal_hw.calib.validation import checks, diagnosis, explain
+from deal_hw.calib.validation import checks
 from deal_hw.calib.validation.checks import (
     HALVES,
     SplitHalf,
@@ -274,7 +275,7 @@ def test_causes_come_before_halves(
         asked.append(name)
         return False
 
-    for module in (diagnosis, explain):
+    for module in (diagnosis, trials):
         monkeypatch.setattr(module, "fit_wider", lambda *_: pytest.fail("a wider model was fitted"))
     wrong = dataclasses.replace(noisy_refined, chi2=5.0)
     known = uncertainty_at(noisy_problem, wrong, fixed_latency=True)

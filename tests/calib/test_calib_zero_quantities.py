@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.validation.explanations import ZEROS
+from deal_hw.calib.hypotheses.laws import ZEROS
 from deal_hw.testing.plain_faults import WITHOUT, Fault
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input, usual_method

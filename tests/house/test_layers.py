@@ -71,7 +71,9 @@ ROOMS = {
     "calib": (
         {"data"},
         {"paper", "fit"},
-        {"search", "baselines", "validation"},
+        {"search", "baselines"},
+        {"hypotheses"},
+        {"validation"},
         {"design"},
         {"pipeline", "report"},
     ),

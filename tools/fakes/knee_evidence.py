@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.validation.evidence import Evidence
-from deal_hw.calib.validation.signatures import Cause, Signature
+from deal_hw.calib.hypotheses.evidence import Evidence
+from deal_hw.calib.hypotheses.signatures import Cause, Signature
 from deal_hw.types import FloatArray
 
 WINDOWS, SAMPLES, PERIOD_S, STD = 24, 80, 0.005, 1e-4

@@ -9,7 +9,7 @@ chance: a robot can have both. Then the fit is repeated with a delay of its own 
 :mod:`deal_hw.calib.fit.command_delays`.
 
 Where they are not found, the residual may still be far likelier with these processes than as white noise.
-Then the fit allows for them; see :mod:`deal_hw.calib.validation.random_errors`. If white noise is as likely,
+Then the fit allows for them; see :mod:`deal_hw.calib.hypotheses.random_errors`. If white noise is as likely,
 commands may jitter all the same where sample times do: intervals hold what the residual leaves possible.
 """
 
@@ -43,8 +43,8 @@ from deal_hw.calib.fit.intervals import (
 )
 from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.random_errors import (
+from deal_hw.calib.hypotheses.cause_words import Diagnosis
+from deal_hw.calib.hypotheses.random_errors import (
     FORCES,
     ComparedErrors,
     LikelyErrors,
@@ -173,7 +173,7 @@ class DelaysAsked:
         found: The fit with random delays; None where the residual does not show any.
         correlated: Without such a fit: whether the residual is no larger than the noise, but likelier with
             random errors of any kind than as white noise, beyond chance; see
-            :func:`~deal_hw.calib.validation.random_errors.fit_errors`.
+            :func:`~deal_hw.calib.hypotheses.random_errors.fit_errors`.
         possible: Without such a fit: delays of commands that jitter as the sample times do, or as much as the
             residual leaves possible. None where sample times do not jitter, or nothing was asked.
     """

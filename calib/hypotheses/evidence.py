@@ -13,15 +13,15 @@ from functools import cached_property
 
 import numpy as np
 
+from deal_hw.calib.data.folds import fold_numbers
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import correlated_samples
-from deal_hw.calib.validation.cause_words import SearchedKinds
-from deal_hw.calib.validation.cross_validation import fold_numbers
-from deal_hw.calib.validation.random_delay import most_delay_std_s
-from deal_hw.calib.validation.signatures import (
+from deal_hw.calib.hypotheses.cause_words import SearchedKinds
+from deal_hw.calib.hypotheses.random_delay import most_delay_std_s
+from deal_hw.calib.hypotheses.signatures import (
     Signature,
     SignatureResponse,
     answers,
@@ -226,7 +226,7 @@ class Evidence:
 
 
 def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Evidence:
-    """Return the evidence for :func:`deal_hw.calib.validation.diagnosis.diagnose`.
+    """Return the evidence for :func:`deal_hw.calib.hypotheses.diagnosis.diagnose`.
 
     Args:
         problem: The problem.

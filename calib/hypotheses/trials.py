@@ -18,9 +18,9 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.validation.cause_words import Diagnosis
-from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of
-from deal_hw.calib.validation.explanations import (
+from deal_hw.calib.hypotheses.cause_words import Diagnosis
+from deal_hw.calib.hypotheses.evidence import Evidence, evidence, groups_of
+from deal_hw.calib.hypotheses.laws import (
     EXPLANATIONS,
     LAG,
     LIMITS,
@@ -35,8 +35,8 @@ from deal_hw.calib.validation.explanations import (
     sized,
     tried_value,
 )
-from deal_hw.calib.validation.signatures import Signature, whitened_changes
-from deal_hw.calib.validation.wider_models import WiderFit, fit_wider, gain_of, wider_cost
+from deal_hw.calib.hypotheses.signatures import Signature, whitened_changes
+from deal_hw.calib.hypotheses.wider_models import WiderFit, fit_wider, gain_of, wider_cost
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace

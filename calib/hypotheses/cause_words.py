@@ -14,7 +14,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import ended_at_bound
-from deal_hw.calib.validation.signatures import Cause
+from deal_hw.calib.hypotheses.signatures import Cause
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
 from deal_hw.sim.parameters import KIND_TABLE

@@ -18,16 +18,20 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.solver import BURST_KURTOSIS, kurtosis
-from deal_hw.calib.validation.candidates import (
+from deal_hw.calib.hypotheses.candidates import (
     Candidate,
     Diagnosed,
     effect_candidates,
     law_candidates,
     ranked,
 )
-from deal_hw.calib.validation.cause_words import LOOKS, Diagnosis, advice, stretch_words
-from deal_hw.calib.validation.evidence import Evidence, evidence, groups_of, unsure_shift
-from deal_hw.calib.validation.explain import (
+from deal_hw.calib.hypotheses.cause_words import LOOKS, Diagnosis, advice, stretch_words
+from deal_hw.calib.hypotheses.evidence import Evidence, evidence, groups_of, unsure_shift
+from deal_hw.calib.hypotheses.random_delay import random_delay
+from deal_hw.calib.hypotheses.random_errors import SeenErrors
+from deal_hw.calib.hypotheses.recording_zeros import MOST_ZERO, named_zeros
+from deal_hw.calib.hypotheses.signatures import Cause, Signature, masses
+from deal_hw.calib.hypotheses.trials import (
     DECISIVE,
     Allows,
     Tried,
@@ -37,11 +41,7 @@ from deal_hw.calib.validation.explain import (
     likeliest,
     try_explanations,
 )
-from deal_hw.calib.validation.random_delay import random_delay
-from deal_hw.calib.validation.random_errors import SeenErrors
-from deal_hw.calib.validation.recording_zeros import MOST_ZERO, named_zeros
-from deal_hw.calib.validation.signatures import Cause, Signature, masses
-from deal_hw.calib.validation.wider_models import fit_wider, gain_of, wider_cost
+from deal_hw.calib.hypotheses.wider_models import fit_wider, gain_of, wider_cost
 from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray

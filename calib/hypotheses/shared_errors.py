@@ -22,7 +22,7 @@ from deal_hw.calib.data.parts import measurements, samples_in
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
-from deal_hw.calib.validation.candidates import Candidate
+from deal_hw.calib.hypotheses.candidates import Candidate
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step

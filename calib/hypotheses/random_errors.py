@@ -29,7 +29,7 @@ from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.fit.solver import BURST_KURTOSIS, kurtosis
 from deal_hw.calib.fit.unexplained import Unexplained
-from deal_hw.calib.validation.signatures import SignatureResponse, answers
+from deal_hw.calib.hypotheses.signatures import SignatureResponse, answers
 from deal_hw.types import FloatArray
 
 Process: TypeAlias = Literal["delay", "slow delay", "white", "slow"]

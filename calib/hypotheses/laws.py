@@ -1,7 +1,7 @@
 """Laws and quantities that a model may lack, as candidates that explain a residual.
 
 Each candidate is a model with more parameters. It is fitted to a part of the recordings and predicts the rest
-(:mod:`deal_hw.calib.validation.wider_models`). Candidates are compared by that prediction alone.
+(:mod:`deal_hw.calib.hypotheses.wider_models`). Candidates are compared by that prediction alone.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.validation.cause_words import LOOKS
-from deal_hw.calib.validation.signatures import Cause, masses
-from deal_hw.calib.validation.wider_models import MOST_FORCE, motion, zero_parameters
+from deal_hw.calib.hypotheses.cause_words import LOOKS
+from deal_hw.calib.hypotheses.signatures import Cause, masses
+from deal_hw.calib.hypotheses.wider_models import MOST_FORCE, motion, zero_parameters
 from deal_hw.calibration import listed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
