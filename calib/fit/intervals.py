@@ -71,10 +71,6 @@ LEAST_JITTER_S = 1e-4
 """Least jitter of the sample times that is an alarm [s]. Fast motion without noise looks like jitter of
 some hundredths of a millisecond."""
 
-EVIDENCE = 20.0
-"""Least gain in deviance of a cause, a correction or another minimum [-]: 20 is odds of 22,000 to 1."""
-
-
 KINKS = 1.2
 """Factor on standard deviations for nonlinearity [-]: stick-slip and saturation bend the likelihood. On
 tuning seeds, 90 % intervals without it contained 86-89 % of the truths."""

@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.hypotheses.cause_words import LOOKS, Diagnosis
 from deal_hw.calib.hypotheses.evidence import Evidence, groups_of
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.hypotheses.trials import Explained, Tried
 from deal_hw.types import FloatArray
 

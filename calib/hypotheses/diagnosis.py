@@ -15,7 +15,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.solver import BURST_KURTOSIS, kurtosis
 from deal_hw.calib.hypotheses.candidates import (
@@ -31,8 +30,15 @@ from deal_hw.calib.hypotheses.random_delay import random_delay
 from deal_hw.calib.hypotheses.random_errors import SeenErrors
 from deal_hw.calib.hypotheses.recording_zeros import MOST_ZERO, named_zeros
 from deal_hw.calib.hypotheses.signatures import Cause, Signature, masses
-from deal_hw.calib.hypotheses.trials import (
+from deal_hw.calib.hypotheses.thresholds import (
+    BURST_LEFT,
     DECISIVE,
+    EVIDENCE,
+    MOST_CAUSES,
+    NEAR_CHI2,
+    NOTICED,
+)
+from deal_hw.calib.hypotheses.trials import (
     Allows,
     Tried,
     explained,
@@ -46,19 +52,8 @@ from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
 
-NOTICED = 0.03
-"""Least share of the held-out squared residual that a signature explains [-]."""
-
-MOST_CAUSES = 3
-"""Most named causes."""
-
 ALIKE = 0.8
 """Least explained share of a named body's mass, relative to the best one's [-]."""
-
-POOR = 9.0
-"""Chi2 that a cause may leave without explaining the share ``decisive`` [-]. Effects are computed around
-the fit. Where most of a residual of three times the noise stays unexplained, the fit is not the robot, and
-what remains can look like any cause."""
 
 REVERSALS = 0.2
 """Share that play must explain in a poor fit [-]."""
@@ -74,10 +69,6 @@ BURST_SHARE = 0.4
 
 BURST_SIZE = 40.0
 """Least squared residual of a burst over the median [-]."""
-
-BURST_LEFT = 4.0
-"""Chi2 that bursts may leave: twice the noise [-]."""
-
 
 MASS = "another mass"
 """Name of a check."""
@@ -117,7 +108,7 @@ def diagnose(
         found = sorted((*effects, *wider), key=lambda f: -f.deviance)
         again = {one.explanation.name for one in tried}
         rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
-        if refined.chi2 <= POOR:
+        if refined.chi2 <= NEAR_CHI2:
             unsure = unnamed_shift(known(), {one.code for one in found})
     rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
     return Diagnosed(tuple(found), ranked(rows), unsure)
@@ -142,7 +133,7 @@ def weighs(
 
 def supported(share: float, chi2: float) -> bool:
     """Return whether a cause that explains a share of a residual is more than an accident of a poor fit."""
-    return share >= DECISIVE or chi2 * (1 - share) <= POOR
+    return share >= DECISIVE or chi2 * (1 - share) <= NEAR_CHI2
 
 
 def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from deal_hw.calib.data.folds import fold_numbers
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, ended_at_bound
+from deal_hw.calib.fit.intervals import ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.fit.solver import correlated_samples
@@ -28,6 +28,7 @@ from deal_hw.calib.hypotheses.signatures import (
     by_recording,
     signatures,
 )
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.sim.recordings.own_setups import recordings_of
 from deal_hw.types import FloatArray
 

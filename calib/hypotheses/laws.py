@@ -1,23 +1,17 @@
-"""Laws and quantities that a model may lack, as candidates that explain a residual.
-
-Each candidate is a model with more parameters. It is fitted to a part of the recordings and predicts the rest
-(:mod:`deal_hw.calib.hypotheses.wider_models`). Candidates are compared by that prediction alone.
-"""
+"""The table of laws and quantities that a model may lack, each a hypothesis on the robot."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.hypotheses.cause_words import LOOKS
+from deal_hw.calib.hypotheses.hypothesis import Hypothesis
 from deal_hw.calib.hypotheses.signatures import Cause, masses
 from deal_hw.calib.hypotheses.wider_models import MOST_FORCE, motion, zero_parameters
-from deal_hw.calibration import listed
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import Parameter, Scale
 from deal_hw.sim.parameters import KIND_TABLE, with_doubts
@@ -59,39 +53,6 @@ FIRST_SHARE = 0.3
 SPEEDS = (0.01, 1.0)
 """Least and largest Stribeck speed that is tried, in rms speeds of the joint [-]. A faster one cannot be told
 from less damping."""
-
-
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """A law or quantity that the model lacks and the robot may have.
-
-    Attributes:
-        name: What it is.
-        cause: The cause that it stands for.
-        parameters: Its parameters, those of a size first; none where it does not apply.
-        means: What it means.
-        do: What to do about it, with {} for the joints or bodies.
-        taken: What to do where the result has it, with {} for the names of its parameters there.
-        in_mjcf: Whether an MJCF can say it.
-        certain: Whether each robot has it, so that a result with it has no weakness, whatever its values are.
-    """
-
-    name: str
-    cause: Cause
-    parameters: Callable[[Problem], list[Parameter]]
-    means: str
-    do: str
-    taken: str
-    in_mjcf: bool = False
-    certain: bool = False
-
-    def taken_as(self, names: Sequence[str], rivals: Sequence[str] = ()) -> str:
-        """Return what to do where the result has it as these parameters.
-
-        ``rivals`` are the names of others that explain the recordings alike.
-        """
-        do = self.taken.replace("{}", listed(list(names)))
-        return do + f" Recordings like these do not tell it from {listed(list(rivals))}." if rivals else do
 
 
 def _friction(problem: Problem) -> list[Parameter]:
@@ -272,11 +233,11 @@ _WRITE = (
 _TAKE = "Use this result: it has them as {}, and so has its MJCF."
 
 
-def _zero(name: str, cause: Cause, parameters: Callable[[Problem], list[Parameter]]) -> Explanation:
-    return Explanation(name, cause, parameters, _NOT_SEARCHED, _WRITE, _TAKE, in_mjcf=True)
+def _zero(name: str, cause: Cause, parameters: Callable[[Problem], list[Parameter]]) -> Hypothesis:
+    return Hypothesis(name, cause, parameters, _NOT_SEARCHED, _WRITE, _TAKE, in_mjcf=True, far=True)
 
 
-ZEROS: Sequence[Explanation] = (
+ZEROS: Sequence[Hypothesis] = (
     _zero("dry friction that is 0 in the model", "friction", _friction),
     _zero("damping that is 0 in the model", "damping", _damping),
     _zero("a rotor's inertia that is 0 in the model", "inertia", _rotor),
@@ -285,8 +246,8 @@ ZEROS: Sequence[Explanation] = (
 """Quantities that an MJCF can say, and this one does not: a model made from a URDF often has none of them."""
 
 
-def _at_limit(name: str, parameters: Callable[[Problem], list[Parameter]]) -> Explanation:
-    return Explanation(
+def _at_limit(name: str, parameters: Callable[[Problem], list[Parameter]]) -> Hypothesis:
+    return Hypothesis(
         name,
         "drive",
         parameters,
@@ -299,7 +260,7 @@ def _at_limit(name: str, parameters: Callable[[Problem], list[Parameter]]) -> Ex
     )
 
 
-LIMITS: Sequence[Explanation] = (
+LIMITS: Sequence[Hypothesis] = (
     _at_limit("other dampings of drives at their effort limit", _dampings),
     _at_limit("other dampings and effort limits of drives at these limits", _at_limits),
 )
@@ -312,7 +273,7 @@ ZERO_CAUSES: Mapping[str, Cause] = {
 }
 """Cause that a parameter stands for which is 0 in the model."""
 
-PLAY = Explanation(
+PLAY = Hypothesis(
     "play in the gears",
     "backlash",
     _play,
@@ -320,21 +281,24 @@ PLAY = Explanation(
     "either side.",
     "Repair the gear of {}, or free servo_play there (--parameters).",
     "Repair the gear. Until then use this result: it has the play as {}.",
+    hidden=True,
+    far=True,
 )
 
-LAG = Explanation(
+LAG = Hypothesis(
     "drives that lag",
     "drive",
     _lag,
     "The drive follows its command with a first-order lag, as one with a filter or an inductance does.",
     "Free command_lag of {} (--parameters).",
     "Use this result: it has the lag as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
+    hidden=True,
 )
 
-EXPLANATIONS: Sequence[Explanation] = (
+HYPOTHESES: Sequence[Hypothesis] = (
     *ZEROS,
     PLAY,
-    Explanation(
+    Hypothesis(
         "friction that falls with speed",
         "friction",
         _falling,
@@ -342,7 +306,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Free dof_friction_stribeck and dof_stribeck_speed of {} (--parameters).",
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
+    Hypothesis(
         "friction that rises with speed",
         "friction",
         _rising,
@@ -351,7 +315,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Free dof_friction_stribeck, below 0, and dof_stribeck_speed of {} (--parameters).",
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
+    Hypothesis(
         "friction that grows with load",
         "friction",
         _load,
@@ -359,7 +323,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Free dof_friction_load of {} (--parameters).",
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
+    Hypothesis(
         "friction that grows with the motor's torque",
         "friction",
         _motor_load,
@@ -369,7 +333,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
     LAG,
-    Explanation(
+    Hypothesis(
         "motors that do more to one side",
         "drive",
         _motor,
@@ -377,7 +341,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Check the motor of {} and its drive, or free command_asymmetry there (--parameters).",
         "Check the motor and its drive. Until then use this result: it has the difference as {}.",
     ),
-    Explanation(
+    Hypothesis(
         "motors with a dead zone",
         "drive",
         _motor_dead_zone,
@@ -385,7 +349,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Free command_dead_zone of {} (--parameters).",
         "Use this result: it has the zone as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
+    Hypothesis(
         "servos with a dead zone",
         "drive",
         _servo_dead_zone,
@@ -393,7 +357,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Make the dead zone of {} smaller in the servo, or free servo_dead_zone there (--parameters).",
         "Use this result: it has the zone as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
+    Hypothesis(
         "effort that falls with speed",
         "drive",
         _free_speed,
@@ -401,7 +365,7 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Free motor_free_speed of {} (--parameters).",
         "Use this result: it has the law as {}. In your own MuJoCo loop deal_hw.sim.actuators applies it.",
     ),
-    Explanation(
+    Hypothesis(
         "encoders with another scale",
         "scale",
         _scale,
@@ -410,18 +374,18 @@ EXPLANATIONS: Sequence[Explanation] = (
         "Correct the counts a turn. Until then use this result: it has the scale as {}.",
     ),
 )
-"""Candidates, those with the fewest parameters first."""
+"""What is asked, the simplest first."""
 
 
-def other_masses(problem: Problem) -> list[Explanation]:
-    """Return another mass of each moving body, each an explanation of its own.
+def other_masses(problem: Problem) -> list[Hypothesis]:
+    """Return another mass of each moving body, each a hypothesis of its own.
 
     Motion under position servos shows ratios of masses, so all of them at once would not be determined.
     """
     looks, means, do = LOOKS["mass"]
     taken = "Weigh that body. Until then use this result: it has the mass as {}, and so has its MJCF."
     return [
-        Explanation(
+        Hypothesis(
             f"{looks} of {p.elements[0]}", "mass", partial(_alone, mass=p), means, do, taken, in_mjcf=True
         )
         for p in masses(problem)
@@ -431,55 +395,6 @@ def other_masses(problem: Problem) -> list[Explanation]:
 def _alone(problem: Problem, *, mass: Parameter) -> list[Parameter]:
     del problem
     return [mass]
-
-
-TRIED = 0.02
-"""Value whose effect is simulated where a fit begins at 0, as a share of the largest one [-]."""
-
-SHAPES = ("dof_stribeck_speed",)
-"""Kinds without an effect of their own: they shape that of another parameter."""
-
-
-def off_value(p: Parameter) -> float:
-    """Return the value at which a parameter has no effect, or the least in its range."""
-    if p.kind == FREE_SPEED:
-        return p.high
-    return p.nominal if p.scale == "log" else 0.0
-
-
-def sized(parameters: Sequence[Parameter]) -> list[int]:
-    """Return the indices of parameters that have an effect of their own."""
-    return [k for k, p in enumerate(parameters) if p.kind not in SHAPES]
-
-
-def one_sided(problem: Problem, parameters: Sequence[Parameter]) -> npt.NDArray[np.bool_]:
-    """Return which sized parameters have no effect at an end of their range, so that only one way is left."""
-    # A filter of the MJCF is no end: the robot's lag may be shorter.
-    free = () if problem.robot.filters is None else ("command_lag",)
-    return np.array(
-        [
-            parameters[k].kind not in free
-            and off_value(parameters[k]) in (parameters[k].low, parameters[k].high)
-            for k in sized(parameters)
-        ],
-        dtype=bool,
-    )
-
-
-def values_in_words(parameters: Sequence[Parameter], values: Sequence[float]) -> str:
-    """Return found values as in an alarm: "a.play = 0.01 rad and b.play = 0.02 rad".
-
-    Those that are 0 are left out, if others are not: a fit found nothing there.
-    """
-    pairs = list(zip(parameters, values, strict=True))
-    told = [(p, value) for p, value in pairs if value] or pairs
-    return listed([f"{p.name} = {value:.2g} {p.unit}".rstrip(" -") for p, value in told])
-
-
-def tried_value(p: Parameter) -> float:
-    """Return a value with some effect."""
-    off = off_value(p)
-    return p.nominal if p.nominal != off else off + TRIED * (p.high - off)
 
 
 def _searched(problem: Problem, kind: str) -> bool:

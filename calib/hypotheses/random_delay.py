@@ -34,13 +34,7 @@ from deal_hw.calib.fit.command_delays import (
     likely_std,
     moved_commands,
 )
-from deal_hw.calib.fit.intervals import (
-    EVIDENCE,
-    LEAST_JITTER_S,
-    MISMATCH_CHI2,
-    Uncertainty,
-    kinks_of,
-)
+from deal_hw.calib.fit.intervals import LEAST_JITTER_S, MISMATCH_CHI2, Uncertainty, kinks_of
 from deal_hw.calib.fit.refinement import STAGES_S, WORSE, Refined, refine
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
@@ -51,6 +45,7 @@ from deal_hw.calib.hypotheses.random_errors import (
     SeenErrors,
     at_least,
 )
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calibration import Z90
 from deal_hw.errors import InsufficientDataError
 from deal_hw.findings import Finding

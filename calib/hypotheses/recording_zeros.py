@@ -14,6 +14,7 @@ import numpy as np
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.hypotheses.thresholds import WINDOW_S
 from deal_hw.errors import InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -25,9 +26,6 @@ MOST_ZERO = 0.3
 
 MOST_NAMED = 6
 """Most recordings whose zero an alarm has."""
-
-WINDOW_S = 0.2
-"""Windows in which zeros of held-out recordings are fitted [s]."""
 
 
 def own_zeros(joints: Mapping[str, str], recordings: Sequence[str]) -> list[Parameter]:

@@ -20,9 +20,10 @@ import numpy as np
 
 from deal_hw.calib.data.parts import measurements, samples_in
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, NEGLIGIBLE_CHI2
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.hypotheses.candidates import Candidate
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NOTICED_CORRECTION, WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
@@ -46,9 +47,6 @@ STRETCH_S = 1.0
 PART_S = 4.0
 """Length of data that is fitted, and that is predicted, evenly spread [s]."""
 
-WINDOW_S = 0.2
-"""Windows of the fits [s]; windows of other clocks have as many samples."""
-
 TRIED = 5
 """Number of candidates that are fitted: those that the nominal values predict best."""
 
@@ -62,9 +60,6 @@ error its correction had at most 0.74 times their residual after two steps."""
 BEHIND = 1.5
 """Ratio of its mean squared residual to theirs above which it is far behind [-]: twice the largest above.
 Wrong corrections of a real Go2 had 2.3 to 2.9, and took another ten steps each."""
-
-NOTICED = 0.2
-"""Least share of the held-out squared residual that it explains, where only noise remains [-]."""
 
 ALIKE = 1.1
 """Largest ratio of the held-out squared residual to the best one's for candidates that are named together
@@ -359,7 +354,7 @@ def _decides(before: float, after: float, count: int) -> bool:
     """
     if before <= NEGLIGIBLE_CHI2 or not after <= MISMATCH_CHI2:
         return False
-    if not after < (1 - NOTICED) * before:
+    if not after < (1 - NOTICED_CORRECTION) * before:
         return False
     return not np.isfinite(before) or count * math.log(before / after) > EVIDENCE
 

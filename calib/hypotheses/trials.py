@@ -15,28 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.evidence import Evidence, evidence, groups_of
-from deal_hw.calib.hypotheses.laws import (
-    EXPLANATIONS,
-    LAG,
-    LIMITS,
-    PLAY,
-    SHAPES,
-    ZERO_CAUSES,
-    ZEROS,
-    Explanation,
-    off_value,
-    one_sided,
-    other_masses,
-    sized,
-    tried_value,
-)
+from deal_hw.calib.hypotheses.hypothesis import SHAPES, Hypothesis, off_value, one_sided, sized, tried_value
+from deal_hw.calib.hypotheses.laws import HYPOTHESES, LIMITS, PLAY, ZERO_CAUSES, other_masses
 from deal_hw.calib.hypotheses.signatures import Signature, whitened_changes
-from deal_hw.calib.hypotheses.wider_models import WiderFit, fit_wider, gain_of, wider_cost
+from deal_hw.calib.hypotheses.thresholds import DECISIVE, EVIDENCE, FAR_CHI2, RIVAL, SURE
+from deal_hw.calib.hypotheses.wider_models import WiderFit, fit_wider, gain_of
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -45,22 +33,8 @@ from deal_hw.types import FloatArray
 Allows = Callable[[str, float], bool]
 """Whether a check, by name, may run that takes at most so many physics steps."""
 
-RIVAL = 0.5
-"""Least screened gain of an explanation that is fitted, over that of the best cause of all [-]."""
-
-DECISIVE = 0.5
-"""Share explained from which other causes are searched only after its repair [-]."""
-
-FAR = 25.0
-"""Chi2 above which effects around a fit say nothing of other laws than play: a residual of five times the
-noise. Local fits of three real robots have 75 to 160. On two of them another law comes first there than
-around fits of predictions, and on the SO-101 it is the latter's that predicts held-out motion better."""
-
 LEAST_PLAY = 0.2
 """Least play of a named joint, as a share of the widest one [-]."""
-
-SURE = 5.0
-"""Least value of a named parameter, in its standard deviations [-]."""
 
 LEAST_RISE = 0.01
 """Least distance of a found mass from the lower end of its range, as a share [-]."""
@@ -77,7 +51,7 @@ class Tried:
         wider: Its fit; None where it was not fitted, or could not be.
     """
 
-    explanation: Explanation
+    explanation: Hypothesis
     of: Problem
     screened: float
     wider: WiderFit | None
@@ -97,7 +71,7 @@ class Explained:
         before: The same without the explanation.
     """
 
-    explanation: Explanation
+    explanation: Hypothesis
     diagnosis: Diagnosis
     problem: Problem
     theta: FloatArray
@@ -149,14 +123,14 @@ def fits_wider_models(problem: Problem) -> bool:
     return problem.robot.base is None and not problem.noise_free
 
 
-def applicable(problem: Problem) -> dict[Explanation, list[Parameter]]:
+def applicable(problem: Problem) -> dict[Hypothesis, list[Parameter]]:
     """Return the explanations that a robot can have, with their parameters."""
     if not fits_wider_models(problem):
         return {}
-    return {each: more for each in EXPLANATIONS if (more := each.parameters(problem))}
+    return {each: more for each in HYPOTHESES if (more := each.parameters(problem))}
 
 
-def of_masses(problem: Problem) -> dict[Explanation, list[Parameter]]:
+def of_masses(problem: Problem) -> dict[Hypothesis, list[Parameter]]:
     """Return another mass of each body, with its parameter."""
     if not fits_wider_models(problem):
         return {}
@@ -173,11 +147,9 @@ def try_explanations(
 ) -> tuple[Tried, ...]:
     """Screen all explanations of a fit's residual, and fit those that promise most.
 
-    Play is always fitted: its effect around a fit without it says little, as nothing moves within it. So is a
-    lag: its linearised effect is that of a delay, which the fit has. Around a poor fit the effect says little
-    of all of them, so only play is fitted then, and what is 0 in the model: the simplest reason. Each body's
-    mass is screened beside the laws. Where one leaves only noise, all are fitted: around a fit without it the
-    ends of ranges may hide that another one does so, too.
+    Each hypothesis says when it is worth a fit. Each body's mass is screened beside the laws. Where one
+    leaves only noise, all are fitted: around a fit without it the ends of ranges may hide that another one
+    does so, too.
 
     Args:
         problem: The problem.
@@ -189,16 +161,17 @@ def try_explanations(
     """
     if any(one.of is problem for one in given):
         return tuple(one for one in given if one.of is problem)
-    can, masses = applicable(problem), of_masses(problem)
-    if refined.chi2 > FAR:
-        can, masses = {each: more for each, more in can.items() if each in (*ZEROS, PLAY)}, {}
+    can, masses = (
+        {each: more for each, more in every.items() if each.worth_asking(refined.chi2)}
+        for every in (applicable(problem), of_masses(problem))
+    )
+    if refined.chi2 > FAR_CHI2:
         gains, enough = dict.fromkeys(can, 0.0), -np.inf
     elif can or masses:
         gains, enough = _gains(problem, refined, can | masses, known)
     found = []
     for each, more in [*can.items(), *sorted(masses.items(), key=lambda pair: -gains[pair[0]])]:
-        fitted = each in (PLAY, LAG) or gains[each] > enough
-        fitted = fitted and allows(each.name, wider_cost(problem, True, len(more)))
+        fitted = each.worth_a_fit(gains[each], enough) and allows(each.name, each.cost(problem, more))
         if fitted:
             say(each.name)
         wide = fit_wider(problem, more) if fitted else None
@@ -219,7 +192,7 @@ def try_limits(problem: Problem, allows: Allows, say: Callable[[str], None]) -> 
     found: tuple[Tried, ...] = ()
     for each in LIMITS if fits_wider_models(problem) else ():
         more = each.parameters(problem)
-        if not more or not allows(each.name, wider_cost(problem, True, len(more))):
+        if not more or not allows(each.name, each.cost(problem, more)):
             continue
         say(each.name)
         wide = fit_wider(problem, more)
@@ -232,9 +205,9 @@ def try_limits(problem: Problem, allows: Allows, say: Callable[[str], None]) -> 
 def _gains(
     problem: Problem,
     refined: Refined,
-    can: Mapping[Explanation, Sequence[Parameter]],
+    can: Mapping[Hypothesis, Sequence[Parameter]],
     known: Callable[[], Evidence] | None,
-) -> tuple[dict[Explanation, float], float]:
+) -> tuple[dict[Hypothesis, float], float]:
     """Return the screened gain of each explanation, and that from which one is fitted."""
     seen = evidence(problem, refined, answered=False) if known is None else known()
     causes = [seen.gain([], group) for group in groups_of(seen.found)]
@@ -284,7 +257,7 @@ def screened(
     latency_s: float,
     shooting: Shooting,
     point: Point,
-    found: Explanation,
+    found: Hypothesis,
     more: Sequence[Parameter],
 ) -> Signature:
     """Return what an explanation's parameters do to the predictions of a fit without it.
@@ -380,7 +353,7 @@ def _value(p: Parameter, found: float) -> str:
     return f"{p.name} = {found:.2g} {p.unit}{model}"
 
 
-def _named(wide: WiderFit, of: Explanation) -> list[int]:
+def _named(wide: WiderFit, of: Hypothesis) -> list[int]:
     """Return the parameters that are sure, largest first, then those that shape them."""
     if of is PLAY:
         found = wide.found

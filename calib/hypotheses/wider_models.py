@@ -13,19 +13,13 @@ import numpy as np
 
 from deal_hw.calib.data.parts import BEGIN_S, part_of, samples_in
 from deal_hw.calib.data.problem import Member, Problem
-from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NOTICED, WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters import KIND_TABLE
 from deal_hw.sim.parameters.default_space import left_at_zero
 from deal_hw.types import FloatArray
-
-WINDOW_S = 0.2
-"""Windows of the fits [s]."""
-
-NOTICED = 0.03
-"""Least share of the held-out squared residual that more parameters explain [-]."""
 
 MOST_INERTIA = 20.0
 """Largest armature that is tried where the model has 0, in inertias of the joint [-]. A real cart has six

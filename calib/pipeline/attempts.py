@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from deal_hw.calib.fit.intervals import FALSE_ALARMS, MISMATCH_CHI2, WHITE_SAMPLES, with_rows
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, refine
 from deal_hw.calib.fit.unexplained import Unexplained
+from deal_hw.calib.hypotheses.thresholds import FAR_CHI2
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import RESTARTS, conclusive, lower_minimum, refined_from
@@ -194,10 +195,9 @@ def with_random_delays(run: CalibrationRun, local: Refined) -> FitOutcome | Cali
 
     Far from the noise delays seem to explain what no parameters there do. A wrong clock is the worse fault.
     """
-    from deal_hw.calib.hypotheses.trials import FAR
     from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
 
-    if local.chi2 > FAR:
+    if local.chi2 > FAR_CHI2:
         return run
     run.say("fit", "does each command act after a delay of its own?")
     if (delays := run.random_delays(local).found) is None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
-from deal_hw.calib.fit.intervals import EVIDENCE
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.validation.settings import Validation
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress, ProgressCallback
 from deal_hw.findings import Finding, SafeChecks
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from deal_hw.calib.fit.refinement import Refined
     from deal_hw.calib.hypotheses.candidates import Candidate
     from deal_hw.calib.hypotheses.cause_words import Diagnosis
-    from deal_hw.calib.hypotheses.laws import Explanation
+    from deal_hw.calib.hypotheses.hypothesis import Hypothesis
     from deal_hw.calib.hypotheses.random_delay import DelaysAsked
     from deal_hw.calib.hypotheses.shared_errors import SharedErrorCheck
     from deal_hw.calib.hypotheses.trials import Tried
@@ -200,7 +200,7 @@ class CalibrationRun:
         if self.progress is not None:
             self.progress(Progress(stage, done, total, message, **candidate))
 
-    def takes(self, explanation: Explanation) -> bool:
+    def takes(self, explanation: Hypothesis) -> bool:
         """Return whether the result may have an explanation: without laws, what an MJCF can say."""
         return self.settings.laws or explanation.in_mjcf
 

@@ -24,7 +24,7 @@ from deal_hw.calib.data.folds import Choice, fold_masks
 from deal_hw.calib.data.noise import Mask
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Member, Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, latency_end
+from deal_hw.calib.fit.intervals import latency_end
 from deal_hw.calib.fit.output_error import (
     Recipe,
     fit_output_error,
@@ -33,9 +33,10 @@ from deal_hw.calib.fit.output_error import (
 )
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
 from deal_hw.calib.hypotheses.candidates import Candidate, Judged, Outcome, ranked
-from deal_hw.calib.hypotheses.laws import LAG, Explanation, values_in_words
-from deal_hw.calib.hypotheses.trials import RIVAL, applicable
-from deal_hw.calib.hypotheses.wider_models import NOTICED
+from deal_hw.calib.hypotheses.hypothesis import Hypothesis, values_in_words
+from deal_hw.calib.hypotheses.laws import LAG
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, MOST_LAWS, NOTICED, RIVAL
+from deal_hw.calib.hypotheses.trials import applicable
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import conclusive, refined_from
@@ -45,12 +46,9 @@ from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
 
-MOST_LAWS = 2
+MOST_FOLDED = 2
 """Most laws that are fitted in the folds. A law is often about as good as another one: play and friction that
 falls with speed both delay a joint that turns round."""
-
-MOST_TAKEN = 3
-"""Most laws that a fit takes, one on top of the other."""
 
 SCREEN_ITERATIONS, FOLD_ITERATIONS, ITERATIONS = 2, 3, 6
 """Most derivatives of each fit with a law, to a part of the recordings, in a fold and to all of them. The
@@ -69,7 +67,7 @@ class LawCandidate:
         start: Where its fits begin: a fit with it to a part of the recordings, (K + L,) and latency [s].
     """
 
-    explanation: Explanation
+    explanation: Hypothesis
     more: Sequence[Parameter]
     seconds: tuple[float, float]
     start: Member
@@ -139,7 +137,7 @@ class ScreenedLaws:
 
     def promising(self) -> list[str]:
         """Return the laws that gain more than chance, and about as much as the best, best first."""
-        order = sorted(self.shares, key=lambda name: -self.shares[name])[:MOST_LAWS]
+        order = sorted(self.shares, key=lambda name: -self.shares[name])[:MOST_FOLDED]
         enough = [n for n in order if self.deviance(n) > EVIDENCE and self.shares[n] > NOTICED]
         return [n for n in enough if self.deviance(n) > RIVAL * self.deviance(order[0])]
 
@@ -281,7 +279,7 @@ def take_laws(
         members = law.members(found.problem, fold=False)
         wide = law.widened(found.problem)
         found = dataclasses.replace(found, problem=wide, member=members[choice.chosen])
-        if len(found.rounds) == MOST_TAKEN:
+        if len(found.rounds) == MOST_LAWS:
             break
         screened = screened_laws(run, wide, [members[law.names[0]]], seconds)
         if not screened.chosen:

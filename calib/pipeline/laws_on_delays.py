@@ -16,21 +16,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, with_rows
+from deal_hw.calib.fit.intervals import with_rows
 from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.hypotheses.candidates import Candidate
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.evidence import Evidence, evidence, unsure_shift
-from deal_hw.calib.hypotheses.laws import (
-    ZERO_CAUSES,
-    Explanation,
-    one_sided,
-    sized,
-    tried_value,
-    values_in_words,
-)
+from deal_hw.calib.hypotheses.hypothesis import Hypothesis, one_sided, sized, tried_value, values_in_words
+from deal_hw.calib.hypotheses.laws import ZERO_CAUSES
 from deal_hw.calib.hypotheses.signatures import Signature
-from deal_hw.calib.hypotheses.trials import FAR, Allows, applicable, screened, screened_effect, screened_gain
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, FAR_CHI2, MOST_LAWS
+from deal_hw.calib.hypotheses.trials import Allows, applicable, screened, screened_effect, screened_gain
 from deal_hw.calib.hypotheses.wider_models import WiderFit, wider_cost
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.validation.checks import with_unsure
@@ -41,9 +36,6 @@ from deal_hw.types import FloatArray
 
 if TYPE_CHECKING:
     from deal_hw.calib.hypotheses.random_delay import DelayFit
-
-MOST_LAWS = 2
-"""Most laws on top of the delays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +74,7 @@ def laws_on_delays(run: CalibrationRun, late: DelayFit, allows: Allows) -> LawsO
     ``allows`` says which fits may be made.
     """
     found = LawsOnDelays(run, dataclasses.replace(late, fit=with_rows(late.fit)))
-    if not run.settings.diagnosis or late.fit.chi2 > FAR:
+    if not run.settings.diagnosis or late.fit.chi2 > FAR_CHI2:
         return found
     while True:
         with run.check(EXPLANATIONS):
@@ -124,9 +116,9 @@ def _with_a_law(
 def _taken(
     before: LawsOnDelays,
     seen: Evidence,
-    effects: Mapping[Explanation, Signature],
-    can: Mapping[Explanation, Sequence[Parameter]],
-    gains: Mapping[Explanation, float],
+    effects: Mapping[Hypothesis, Signature],
+    can: Mapping[Hypothesis, Sequence[Parameter]],
+    gains: Mapping[Hypothesis, float],
     allows: Allows,
 ) -> LawsOnDelays | None:
     """Return the fit with the law that gains most, by its linearised effect and its fit; None without one."""
@@ -184,7 +176,7 @@ def _refined(problem: Problem, theta: FloatArray, begun: Refined) -> Refined | N
         return None
 
 
-def _cause(wide: WiderFit, fit: Refined, law: Explanation, rivals: Sequence[str]) -> Diagnosis:
+def _cause(wide: WiderFit, fit: Refined, law: Hypothesis, rivals: Sequence[str]) -> Diagnosis:
     """Return a law that the result has as a cause of the residual; ``fit`` is without it."""
     before, after = fit.chi2, wide.fit.chi2
     values = values_in_words(wide.more, list(map(float, wide.found)))

@@ -12,8 +12,9 @@ import numpy as np
 from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.parts import BEGIN_S, part_of
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import CORRELATION_SAMPLES, EVIDENCE, MISMATCH_CHI2, WHITE_SAMPLES
+from deal_hw.calib.fit.intervals import CORRELATION_SAMPLES, MISMATCH_CHI2, WHITE_SAMPLES
 from deal_hw.calib.fit.refinement import Refined, from_start, window_stages
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray

@@ -27,13 +27,7 @@ import numpy as np
 
 from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Member, Problem
-from deal_hw.calib.fit.intervals import (
-    MISMATCH_CHI2,
-    Uncertainty,
-    names_at_bound,
-    uncertainty_at,
-    with_rows,
-)
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, Uncertainty, names_at_bound, uncertainty_at, with_rows
 from deal_hw.calib.fit.null_space import confounded
 from deal_hw.calib.fit.output_error import (
     SECANTS,
@@ -46,6 +40,7 @@ from deal_hw.calib.fit.output_error import (
 )
 from deal_hw.calib.fit.refinement import LOCAL_HOPELESS, Refined, at_parameters
 from deal_hw.calib.fit.unexplained import Unexplained
+from deal_hw.calib.hypotheses.thresholds import FAR_CHI2
 from deal_hw.calib.pipeline.calibration_run import AFTER_FIT, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.stages import CalibrationPipeline, Fits, Refinement
 from deal_hw.calib.pipeline.wider_ranges import fit_beyond_ends
@@ -181,8 +176,8 @@ class OutputErrorFits(Fits):
         from deal_hw.calib.data.folds import Choice
         from deal_hw.calib.hypotheses.candidates import ranked
         from deal_hw.calib.hypotheses.diagnosis import diagnose
-        from deal_hw.calib.hypotheses.laws import EXPLANATIONS
-        from deal_hw.calib.hypotheses.trials import FAR, refused
+        from deal_hw.calib.hypotheses.laws import HYPOTHESES
+        from deal_hw.calib.hypotheses.trials import refused
         from deal_hw.calib.pipeline.law_choice import (
             LawfulChoice,
             ScreenedLaws,
@@ -227,7 +222,7 @@ class OutputErrorFits(Fits):
             # With fitted start states the residual shows model error, not smoothing error.
             left = at_parameters(problem, theta, latency_s, samples_in(problem, settings.mismatch_s))
             chi2 = left.normal.cost / max(left.normal.count, 1)
-            if chi2 <= FAR and (exact := explained_by_laws(run, searched, laws)):
+            if chi2 <= FAR_CHI2 and (exact := explained_by_laws(run, searched, laws)):
                 return exact
         recipe = settings.recipe(choice.chosen)
         with_latency = dataclasses.replace(recipe, latency=True)
@@ -248,7 +243,7 @@ class OutputErrorFits(Fits):
                     allows: Allows = run.allows
                     if run.settings.cross_validation:
                         # The cross-validation has judged laws already.
-                        allows = refused(allows, [law.name for law in EXPLANATIONS if run.takes(law)])
+                        allows = refused(allows, [law.name for law in HYPOTHESES if run.takes(law)])
                     found = run.safely.run(checks.CAUSES, None, diagnose, of, shown, run.tried, allows)
             of_halves = (run, problem, fit, recipe, known)
             split = run.safely.run(checks.HALVES, checks.FAILED, self._split_half, *of_halves)

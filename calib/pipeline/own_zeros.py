@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, with_rows
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import Refined, local_fit
+from deal_hw.calib.hypotheses.thresholds import DECISIVE, EVIDENCE, NEAR_CHI2
 from deal_hw.calib.pipeline.calibration_run import OWN_ZEROS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.pipeline.minima import conclusive
@@ -43,11 +44,9 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | Calibrat
     """
     from deal_hw.calib.hypotheses.candidates import Candidate
     from deal_hw.calib.hypotheses.cause_words import LOOKS, Diagnosis
-    from deal_hw.calib.hypotheses.diagnosis import POOR
     from deal_hw.calib.hypotheses.evidence import evidence
     from deal_hw.calib.hypotheses.recording_zeros import common_zeros, named_zeros, own_zeros, zeros_of
     from deal_hw.calib.hypotheses.signatures import zeros
-    from deal_hw.calib.hypotheses.trials import DECISIVE
     from deal_hw.calib.hypotheses.wider_models import fit_wider, gain_of, wider_cost
 
     problem, names = run.problem, recordings_of(e.name for e in run.problem.episodes)
@@ -57,7 +56,7 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | Calibrat
     with run.check(OWN_ZEROS):
         known = evidence(problem, with_rows(local), answered=False)
         share, joints, differ = _share(known)
-        if local.chi2 * share < DECISIVE * (local.chi2 - 1) or local.chi2 * (1 - share) > POOR:
+        if local.chi2 * share < DECISIVE * (local.chi2 - 1) or local.chi2 * (1 - share) > NEAR_CHI2:
             return run
         units = {p.elements[0]: p.unit for p in shared if p.elements[0] in joints}
         more = own_zeros(units, names) if differ else common_zeros(units)

@@ -21,16 +21,12 @@ import numpy as np
 from deal_hw.calib.data.checks import check_excitation
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
-from deal_hw.calib.fit.intervals import (
-    MISMATCH_CHI2,
-    WHITE_SAMPLES,
-    uncertainty_at,
-    with_rows,
-)
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, WHITE_SAMPLES, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import (
     Refined,
     local_fit,
 )
+from deal_hw.calib.hypotheses.thresholds import FAR_CHI2
 from deal_hw.calib.pipeline.attempts import (
     MODEL_HOLDS,
     MODEL_LACKS,
@@ -289,11 +285,11 @@ def far_from_noise(run: CalibrationRun, refined: Refined) -> bool:
     Where folds over the motions are asked for, the fit that predicts best is then better than the one that
     explains most. A free base has its own windows (`gait`), and a given residual scale its own meaning.
     """
-    from deal_hw.calib.hypotheses.trials import FAR
-
     problem = run.problem
     known = problem.known_std is not None or problem.noise_free
-    return run.settings.cross_validation and refined.chi2 > FAR and problem.robot.base is None and not known
+    return (
+        run.settings.cross_validation and refined.chi2 > FAR_CHI2 and problem.robot.base is None and not known
+    )
 
 
 def _refined_again(run: CalibrationRun, problem: Problem, fit: Refined) -> Refined | None:
@@ -308,11 +304,10 @@ def best_of(fits: Fits, run: CalibrationRun) -> FitOutcome:
 
     Far from the noise delays would explain what no parameters there do.
     """
-    from deal_hw.calib.hypotheses.trials import FAR
     from deal_hw.calib.pipeline.laws_on_delays import laws_on_delays
 
     found, local = fits.best(run), run.local
-    if not run.settings.diagnosis or local is None or local.chi2 > FAR:
+    if not run.settings.diagnosis or local is None or local.chi2 > FAR_CHI2:
         return found
     late = run.random_delays(local).found
     if late is None or not found.chi2 > max(late.fit.chi2, MISMATCH_CHI2):

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.hypotheses.recording_zeros import next_zeros
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.verdict import grouped, make_story, trust

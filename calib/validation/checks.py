@@ -35,6 +35,7 @@ from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
+from deal_hw.calib.hypotheses.thresholds import MOST_ALARMS
 from deal_hw.calib.hypotheses.trials import Allows, Tried
 from deal_hw.calib.validation.residual_place import residual_place
 from deal_hw.calib.validation.settings import Validation
@@ -43,9 +44,6 @@ from deal_hw.calibration import LATENCY, Z90, listed
 from deal_hw.findings import Finding, SafeChecks
 from deal_hw.parameters import ParameterSpace
 from deal_hw.types import FloatArray
-
-MOST_CAUSES = 2
-"""Most causes of a residual that become alarms; all are in the provenance."""
 
 HALF_ITERATIONS = 6
 """Most iterations of each half's fit."""
@@ -253,7 +251,7 @@ def with_causes(
 
     Where there is none, the alarm says so, and where the residual lies.
     """
-    alarms: list[Finding] = list(found[:MOST_CAUSES])
+    alarms: list[Finding] = list(found[:MOST_ALARMS])
     if not found and refined.chi2 > MISMATCH_CHI2:
         alarms = [Unexplained.larger(refined.chi2, place=residual_place(problem, refined))]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]

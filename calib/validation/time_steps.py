@@ -21,6 +21,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import Uncertainty
 from deal_hw.calib.fit.refinement import Refined, refine_windows
 from deal_hw.calib.fit.residual import Shooting, WindowRows
+from deal_hw.calib.hypotheses.thresholds import NOTICED
 from deal_hw.calibration import Z90, Progress, ProgressCallback, listed
 from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
@@ -161,10 +162,6 @@ CLEARLY = 4.0
 """Chi-square difference that decides between two steps [-]. If the finer step is in truth d standard
 deviations worse, the difference is -d^2 with a spread of 2 d. So by chance it is above 4 in at most 2.3 %
 of recordings, for any d."""
-
-NOTICED = 0.03
-"""Least share of the squared residual by which half the step must lower it for an alarm [-], as for a
-cause of the residual. Intervals are widened by the step's shift without an alarm, too."""
 
 MOST_STEPS = 3e8
 """Most physics steps of the comparison."""

@@ -20,8 +20,8 @@ import numpy as np
 from deal_hw.bench.rows import Cells, RowTable, printed
 from deal_hw.bench.scores import outside_range
 from deal_hw.bench.settings import Verdict
+from deal_hw.calib.hypotheses.thresholds import MOST_ALARMS
 from deal_hw.calib.report.verdict import trust
-from deal_hw.calib.validation.checks import MOST_CAUSES
 from deal_hw.calibration import BEFORE_SEARCH, Budget, CalibrationResult, Progress
 from deal_hw.errors import DealHwError, UnknownNameError
 from deal_hw.testing.plain_faults import (
@@ -127,7 +127,7 @@ def run_cell(kind: str, fault: str, seed: int, *, budget: Budget, threads: int |
             # Refused before any work: counts as red, and as named if the message names the fault.
             named = names(kind, fault, [], [str(err)])
             return row | {"colour": "refused", "named": named, "refusal": str(err)}
-    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_CAUSES]]
+    causes = [str(one["cause"]) for one in result.provenance.get("diagnosis", ())[:MOST_ALARMS]]
     laws = named_laws(result)
     said = [*map(str, result.alarms), *work.telemetry, *messages]
     return row | {

@@ -10,15 +10,15 @@ from fakes.knee_evidence import knee_evidence, knee_motion, moved_by
 
 from deal_hw.calib.data.folds import Choice
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.hypotheses.candidates import Candidate, effect_candidates, law_candidates, ranked
 from deal_hw.calib.hypotheses.diagnosis import name_causes
-from deal_hw.calib.hypotheses.laws import EXPLANATIONS
+from deal_hw.calib.hypotheses.laws import HYPOTHESES
 from deal_hw.calib.hypotheses.laws import PLAY as PLAY_LAW
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.hypotheses.trials import Tried
 from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice, ScreenedLaws
 
-LOAD_LAW = next(law for law in EXPLANATIONS if law.name == "friction that grows with load")
+LOAD_LAW = next(law for law in HYPOTHESES if law.name == "friction that grows with load")
 
 
 def test_signatures_stand_by_what_each_gains_alone() -> None:

@@ -28,12 +28,13 @@ from deal_hw.calib.fit.command_delays import (
     moved_commands,
     with_command_delays,
 )
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import STAGES_S, Refined, refine
 from deal_hw.calib.fit.residual import Shooting
 from deal_hw.calib.hypotheses import random_delay as random_delay_module
 from deal_hw.calib.hypotheses.random_delay import DelaysAsked, RandomDelay, _too_many, fit_delays
 from deal_hw.calib.hypotheses.signatures import signatures
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.search.eki import Eki

@@ -16,7 +16,7 @@ from fakes.plain_truth import problem_of, truth
 from deal_hw.calib.data.folds import fold_numbers
 from deal_hw.calib.data.parts import part_of
 from deal_hw.calib.data.problem import Problem
-from deal_hw.calib.fit.intervals import EVIDENCE, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.hypotheses import diagnosis
@@ -31,6 +31,7 @@ from deal_hw.calib.hypotheses.signatures import (
     place_in_play,
     signatures,
 )
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.hypotheses.trials import explained, try_explanations
 from deal_hw.calib.hypotheses.wider_models import fit_wider, zero_parameters
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes, with_unsure

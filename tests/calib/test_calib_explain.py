@@ -19,15 +19,11 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit
 from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
-from deal_hw.calib.hypotheses.laws import (
-    EXPLANATIONS,
-    off_value,
-    one_sided,
-    tried_value,
-    values_in_words,
-)
+from deal_hw.calib.hypotheses.hypothesis import off_value, one_sided, tried_value, values_in_words
+from deal_hw.calib.hypotheses.laws import HYPOTHESES
 from deal_hw.calib.hypotheses.laws import PLAY as PLAY_LAW
-from deal_hw.calib.hypotheses.trials import DECISIVE, FAR, applicable, explained, try_explanations
+from deal_hw.calib.hypotheses.thresholds import DECISIVE, FAR_CHI2
+from deal_hw.calib.hypotheses.trials import applicable, explained, try_explanations
 from deal_hw.calib.pipeline.attempts import with_explanation
 from deal_hw.calib.pipeline.conclusion import without_search
 from deal_hw.calib.pipeline.law_choice import (
@@ -65,7 +61,7 @@ from deal_hw.workflows.calibration.intake import CalibrationInput
 from deal_hw.workflows.calibration.run import calibrate_or_raise
 from deal_hw.workflows.calibration.settings import CalibrateSettings
 
-STRIBECK_LAW = next(law for law in EXPLANATIONS if law.name == "friction that falls with speed")
+STRIBECK_LAW = next(law for law in HYPOTHESES if law.name == "friction that falls with speed")
 
 
 @pytest.mark.slow
@@ -319,7 +315,7 @@ def test_laws_that_leave_only_noise_are_fitted_with_the_start_states(tmp_path: P
 def test_only_a_residual_far_from_the_noise_is_fitted_by_predictions() -> None:
     """Near it, and where nobody compares predictions, fitted start states tell more."""
     _, problem, fit = truth("pendulum", None)
-    run, poor = small_run(problem), dataclasses.replace(fit, chi2=FAR + 1)
+    run, poor = small_run(problem), dataclasses.replace(fit, chi2=FAR_CHI2 + 1)
     assert far_from_noise(run, poor) and not far_from_noise(run, fit)
     unchecked = Validation(cross_validation=False)
     assert not far_from_noise(dataclasses.replace(run, settings=unchecked), poor)
@@ -435,7 +431,7 @@ def test_a_lag_is_tried_from_the_filter_of_the_mjcf(tmp_path: Path) -> None:
     """That acts already, with its time constant: from another one the candidate would begin worse."""
     text = SERVO.replace('joint="elbow" kp="10"', 'joint="elbow" timeconst=".08" kp="10"')
     problem: Any = SimpleNamespace(robot=robot(tmp_path, text), space=ParameterSpace([]))
-    (lags,) = (law.parameters(problem) for law in EXPLANATIONS if law.name == "drives that lag")
+    (lags,) = (law.parameters(problem) for law in HYPOTHESES if law.name == "drives that lag")
     assert [(p.elements, p.nominal, p.high) for p in lags] == [
         (("shoulder",), 0.005, 0.1),
         (("elbow",), 0.08, 0.16),

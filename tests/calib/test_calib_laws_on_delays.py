@@ -16,7 +16,7 @@ from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, at_parameters
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
-from deal_hw.calib.hypotheses.laws import sized, tried_value
+from deal_hw.calib.hypotheses.hypothesis import sized, tried_value
 from deal_hw.calib.hypotheses.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.hypotheses.signatures import Signature
 from deal_hw.calib.hypotheses.trials import applicable
@@ -212,7 +212,7 @@ def test_no_law_is_asked_for_around_a_poor_fit(
         count.append(None)
         return None, []
 
-    monkeypatch.setattr(laws_on_delays, "FAR", far)
+    monkeypatch.setattr(laws_on_delays, "FAR_CHI2", far)
     monkeypatch.setattr(laws_on_delays, "_with_a_law", none)
     found = laws_on_delays.laws_on_delays(run, late, run.may_try)
     assert len(count) == asked and not found.laws and not len(found.unsure)

@@ -17,9 +17,10 @@ from deal_hw.calib.fit.intervals import MISMATCH_CHI2, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import local_fit
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
-from deal_hw.calib.hypotheses.laws import off_value, one_sided, other_masses, tried_value
+from deal_hw.calib.hypotheses.hypothesis import off_value, one_sided, tried_value
+from deal_hw.calib.hypotheses.laws import other_masses
+from deal_hw.calib.hypotheses.thresholds import FAR_CHI2
 from deal_hw.calib.hypotheses.trials import (
-    FAR,
     Explained,
     explained,
     keeps_mass,
@@ -63,7 +64,7 @@ def test_a_body_that_keeps_nothing_has_no_other_mass() -> None:
 def test_around_a_poor_fit_no_mass_is_fitted() -> None:
     """Its effect there says nothing, and near the noise the same masses are screened."""
     _, problem, fit = truth("double-pendulum", None)
-    poor = try_explanations(problem, dataclasses.replace(fit, chi2=FAR + 1), refused)
+    poor = try_explanations(problem, dataclasses.replace(fit, chi2=FAR_CHI2 + 1), refused)
     near = try_explanations(problem, fit, refused)
     assert not {UPPER, FORE} & {one.explanation.name for one in poor}
     assert {UPPER, FORE} <= {one.explanation.name for one in near}

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from fakes.knee_evidence import PERIOD_S, SAMPLES, WINDOWS
 
-from deal_hw.calib.fit.intervals import EVIDENCE
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.hypotheses.random_delay import random_delay
 from deal_hw.calib.hypotheses.random_errors import (
@@ -20,6 +19,7 @@ from deal_hw.calib.hypotheses.random_errors import (
     SeenErrors,
 )
 from deal_hw.calib.hypotheses.signatures import SignatureResponse
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.types import FloatArray
 
 

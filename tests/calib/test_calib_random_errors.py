@@ -11,7 +11,7 @@ from fakes.small_runs import small_run
 
 from deal_hw.calib.data.noise import NoiseModel
 from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.calib.fit.intervals import EVIDENCE, MISMATCH_CHI2, jitter_alarm, uncertainty_at, with_rows
+from deal_hw.calib.fit.intervals import MISMATCH_CHI2, jitter_alarm, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Shooting, WindowRows
 from deal_hw.calib.hypotheses import random_errors
@@ -24,6 +24,7 @@ from deal_hw.calib.hypotheses.random_errors import (
     whitened_for,
 )
 from deal_hw.calib.hypotheses.signatures import SignatureResponse
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun
 from deal_hw.calib.pipeline.conclusion import conclude_fit
 from deal_hw.calib.validation.settings import Validation

@@ -13,7 +13,7 @@ import pytest
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.refinement import at_parameters, refine, refine_windows
 from deal_hw.calib.fit.residual import Point, Shooting
-from deal_hw.calib.hypotheses.laws import EXPLANATIONS
+from deal_hw.calib.hypotheses.laws import HYPOTHESES
 from deal_hw.calib.validation.time_steps import scan_latency
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.workflows.calibration.intake import calibration_input
@@ -111,7 +111,7 @@ def test_windows_that_are_simulated_together_are_predicted_alike(
     model, paths, _ = write(make_robot("arm", 3), tmp_path, seconds=3.0)
     work = calibration_input(FilesSettings(model=model, data=paths, threads=1))
     plain = Problem(work.robot, work.space, work.episodes, threads=1)
-    more = next(each for each in EXPLANATIONS if each.name == law).parameters(plain)
+    more = next(each for each in HYPOTHESES if each.name == law).parameters(plain)
     found = []
     for together in (1, 64):
         monkeypatch.setattr("deal_hw.calib.data.problem.TOGETHER", together)

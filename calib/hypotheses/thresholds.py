@@ -1,0 +1,65 @@
+"""What decides between hypotheses: each threshold once, with its source.
+
+What decides whether there is anything to explain belongs to the fit
+(:data:`~deal_hw.calib.fit.intervals.MISMATCH_CHI2` and its neighbours).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+FALSE_DISCOVERIES: Final = 0.1
+"""Largest expected share of accepted hypotheses that are wrong, over all that were asked [-]. The customary
+level of Benjamini and Hochberg (1995); held by e-values whatever their dependence (Wang and Ramdas 2022)."""
+
+EVIDENCE: Final = 20.0
+"""Least difference in deviance that no chance makes [-]: odds of 22,000 to 1. Of two fits of the same motion
+that ended in different minima, of two hypotheses, of random errors by the likelihood of the residual that
+they explain, and of a correction of recordings. A hypothesis that predicts unseen motion is accepted at
+:data:`FALSE_DISCOVERIES` instead: how many were asked counts there."""
+
+NOTICED: Final = 0.03
+"""Least share of the held-out squared residual that a hypothesis explains [-]. Long recordings show effects
+that no owner would notice: 3 % of the square is 1.5 % of the error."""
+
+NOTICED_CORRECTION: Final = 0.2
+"""The same of a correction of the recordings [-], which must leave only noise. So what it explains is at most
+a fifth of the noise where the share is smaller, and to doubt a recording takes more."""
+
+DECISIVE: Final = 0.5
+"""Share explained from which other causes are asked for only after its repair [-]: it is more than all others
+together."""
+
+NEAR_CHI2: Final = 9.0
+"""Largest chi2 of a fit from which a cause is named: three times the noise. Effects are computed around the
+fit. Farther from the recordings it is not the robot, and what remains can look like any cause."""
+
+FAR_CHI2: Final = 25.0
+"""Chi2 above which linearised effects around a fit do not even say which hypotheses are worth a fit: five
+times the noise. Local fits of three real robots have 75 to 160. On two of them another law comes first there
+than around fits of predictions, and on the SO-101 it is the latter's that predicts held-out motion better."""
+
+RIVAL: Final = 0.5
+"""Least gain in deviance of a hypothesis that is fitted, over that of the best one [-]. A linearised effect,
+or half of the recordings, is about that uncertain."""
+
+BURST_LEFT: Final = 4.0
+"""Chi2 that bursts may leave: twice the noise. Bursts predict nothing, and are chosen for their size, so only
+what they leave can support them."""
+
+SURE: Final = 5.0
+"""Least value of a parameter that a named hypothesis has, in its standard deviations [-]. Each joint has one,
+and the standard deviations are those of a part of the recordings, without kinks."""
+
+WINDOW_S: Final = 0.2
+"""Windows of fits that hypotheses are judged by [s]: the shortest of a refinement, as even a poor start does
+not diverge in them."""
+
+MOST_CAUSES: Final = 3
+"""Most causes that are named by their signatures; each is judged beside those before it."""
+
+MOST_ALARMS: Final = 2
+"""Most causes of a residual that become alarms; all are in the provenance."""
+
+MOST_LAWS: Final = 3
+"""Most laws that a fit takes, one on top of the other. A fourth has not been seen on a robot."""
