@@ -17,7 +17,7 @@ import numpy as np
 
 from deal_hw.calib.hypotheses.cause_words import LOOKS, Diagnosis
 from deal_hw.calib.hypotheses.evidence import Evidence, groups_of
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE
+from deal_hw.calib.hypotheses.judge import needed
 from deal_hw.calib.hypotheses.trials import Explained, Tried
 from deal_hw.types import FloatArray
 
@@ -102,11 +102,11 @@ def law_candidates(
         named: Names of those that an alarm has.
     """
     gained, named = {one.explanation.name: one.diagnosis for one in found}, set(named)
-    rows = []
+    tried, rows = list(tried), []
     for one in tried:
         name = one.explanation.name
         if one.wider is None:
-            rows.append(_by_effect(name, one.screened))
+            rows.append(_by_effect(name, one.screened, len(tried)))
             continue
         values = tuple(zip((p.name for p in one.wider.more), map(float, one.wider.found), strict=True))
         if name not in gained:
@@ -122,12 +122,13 @@ def effect_candidates(known: Evidence, causes: Sequence[Diagnosis]) -> list[Cand
     """Return the signatures of causes, each alone beside the parameters; then causes without a signature."""
     rows = list[Candidate]()
     left = dict[str, Diagnosis]((cause.code, cause) for cause in causes)
-    for group in groups_of(known.found):
+    groups = groups_of(known.found)
+    for group in groups:
         cause, gain = group[0].cause, known.gain([], group)
         looks = LOOKS[cause][0]
         name = f"{looks} of {group[0].where}" if cause == "mass" else looks
         named = [c for c in causes if c.code == cause and (cause != "mass" or group[0].where in c.subject)]
-        row = _by_effect(name, gain, 1 - float(np.exp(-gain / known.count)))
+        row = _by_effect(name, gain, len(groups), 1 - float(np.exp(-gain / known.count)))
         rows.append(dataclasses.replace(row, outcome="named") if named else row)
         left.pop(cause, None)
     words = {str(cause): looks for cause, (looks, _, _) in LOOKS.items()}
@@ -141,6 +142,6 @@ def ranked(rows: Iterable[Candidate]) -> tuple[Candidate, ...]:
     return tuple(sorted(rows, key=lambda row: (order.index(row.outcome), -(row.deviance or 0.0))))
 
 
-def _by_effect(name: str, gain: float, share: float | None = None) -> Candidate:
-    outcome: Outcome = "not named" if gain > EVIDENCE else "chance"
+def _by_effect(name: str, gain: float, asked: int, share: float | None = None) -> Candidate:
+    outcome: Outcome = "not named" if gain > needed(asked) else "chance"
     return Candidate(explanation=name, judged="effect", outcome=outcome, deviance=float(gain), share=share)

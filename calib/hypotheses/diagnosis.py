@@ -26,6 +26,7 @@ from deal_hw.calib.hypotheses.candidates import (
 )
 from deal_hw.calib.hypotheses.cause_words import LOOKS, Diagnosis, advice, stretch_words
 from deal_hw.calib.hypotheses.evidence import Evidence, evidence, groups_of, unsure_shift
+from deal_hw.calib.hypotheses.judge import alike, needed
 from deal_hw.calib.hypotheses.random_delay import random_delay
 from deal_hw.calib.hypotheses.random_errors import SeenErrors
 from deal_hw.calib.hypotheses.recording_zeros import MOST_ZERO, named_zeros
@@ -47,7 +48,7 @@ from deal_hw.calib.hypotheses.trials import (
     likeliest,
     try_explanations,
 )
-from deal_hw.calib.hypotheses.wider_models import fit_wider, gain_of, wider_cost
+from deal_hw.calib.hypotheses.wider_models import fit_wider, held_out, wider_cost
 from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
@@ -103,7 +104,7 @@ def diagnose(
     if not found:
         wider = [one for one in wider if supported(one.share, refined.chi2)]
         named = {one.code for one in wider}
-        effects = [one for one in name_causes(known(), refined.chi2) if one.code not in named]
+        effects = [one for one in name_causes(known(), refined.chi2, len(tried)) if one.code not in named]
         effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
         found = sorted((*effects, *wider), key=lambda f: -f.deviance)
         again = {one.explanation.name for one in tried}
@@ -128,7 +129,7 @@ def weighs(
         if not (fits_wider_models(problem) and allows(MASS, wider_cost(problem, True, 1))):
             return True
         wide = fit_wider(problem, [body])
-    return wide is not None and keeps_mass(body, wide.found[0]) and gain_of(wide, refined) is not None
+    return wide is not None and keeps_mass(body, wide.found[0]) and held_out(wide, refined) is not None
 
 
 def supported(share: float, chi2: float) -> bool:
@@ -136,7 +137,7 @@ def supported(share: float, chi2: float) -> bool:
     return share >= DECISIVE or chi2 * (1 - share) <= NEAR_CHI2
 
 
-def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
+def name_causes(known: Evidence, chi2: float = 1.0, others: int = 0) -> list[Diagnosis]:
     """Return the causes that evidence supports, best first; each is tested together with those before it.
 
     ``chi2`` is the fit's. Causes with signatures are :func:`supported` together, or none is named.
@@ -144,10 +145,11 @@ def name_causes(known: Evidence, chi2: float = 1.0) -> list[Diagnosis]:
     found: list[Diagnosis] = []
     taken: list[Signature] = []
     groups = groups_of(known.found)
+    asked = others + len(groups)
     while groups and len(found) < MOST_CAUSES:
         groups = [some for group in groups if (some := _possible(known, taken, group))]
         gains = [known.gain(taken, group) for group in groups]
-        if not gains or max(gains) <= EVIDENCE:
+        if not gains or max(gains) < needed(asked, len(found) + 1):
             break
         group = groups[_simplest(groups, gains)]
         share = 1 - float(np.exp(-max(gains) / known.count))
@@ -211,7 +213,7 @@ def _simplest(groups: Sequence[Sequence[Signature]], gains: Sequence[float]) -> 
     best, causes = int(np.argmax(gains)), [group[0].cause for group in groups]
     if causes[best] == "zero" and "load" in causes:
         load = causes.index("load")
-        return load if gains[best] - gains[load] <= EVIDENCE else best
+        return load if alike(gains[best], gains[load]) else best
     return best
 
 

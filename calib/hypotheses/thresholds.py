@@ -12,6 +12,12 @@ FALSE_DISCOVERIES: Final = 0.1
 """Largest expected share of accepted hypotheses that are wrong, over all that were asked [-]. The customary
 level of Benjamini and Hochberg (1995); held by e-values whatever their dependence (Wang and Ramdas 2022)."""
 
+TEMPER: Final = 0.5
+"""Power of a likelihood ratio that counts as evidence [-]. Residuals of a wrong model are no white noise, not
+even one for each correlation time. Of 120 simulated joints with a slow random force, and of 120 with another
+one, 26 and 22 % had a false cause of 5 at the nominal level of 10 % with a power of 1, and 7 and 6 % with
+this one."""
+
 EVIDENCE: Final = 20.0
 """Least difference in deviance that no chance makes [-]: odds of 22,000 to 1. Of two fits of the same motion
 that ended in different minima, of two hypotheses, of random errors by the likelihood of the residual that

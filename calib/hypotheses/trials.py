@@ -21,10 +21,11 @@ from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.evidence import Evidence, evidence, groups_of
 from deal_hw.calib.hypotheses.hypothesis import SHAPES, Hypothesis, off_value, one_sided, sized, tried_value
+from deal_hw.calib.hypotheses.judge import HeldOut, accepted, alike, needed
 from deal_hw.calib.hypotheses.laws import HYPOTHESES, LIMITS, PLAY, ZERO_CAUSES, other_masses
 from deal_hw.calib.hypotheses.signatures import Signature, whitened_changes
-from deal_hw.calib.hypotheses.thresholds import DECISIVE, EVIDENCE, FAR_CHI2, RIVAL, SURE
-from deal_hw.calib.hypotheses.wider_models import WiderFit, fit_wider, gain_of
+from deal_hw.calib.hypotheses.thresholds import DECISIVE, FAR_CHI2, RIVAL, SURE
+from deal_hw.calib.hypotheses.wider_models import WiderFit, fit_wider, held_out
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -216,7 +217,7 @@ def _gains(
         each: screened_gain(seen, screened(*at, each, more), one_sided(problem, more))
         for each, more in can.items()
     }
-    return gains, max(EVIDENCE, RIVAL * max(*causes, *gains.values()))
+    return gains, max(needed(len(gains)), RIVAL * max(*causes, *gains.values()))
 
 
 def screened_gain(known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_]) -> float:
@@ -288,17 +289,28 @@ def screened(
 
 
 def explained(problem: Problem, refined: Refined, tried: Sequence[Tried]) -> list[Explained]:
-    """Return the explanations that predict unseen motion better than the model does without, best first.
+    """Return the hypotheses that the judge accepts among all that were asked, best first.
 
     The fit without them, ``refined``, has used all recordings; each of them saw a part.
     """
-    found = [one for each in tried if (one := _explained(problem, refined, each)) is not None]
-    return sorted(found, key=lambda one: -one.diagnosis.deviance)
+    named, gains = dict[str, tuple[Tried, WiderFit, list[int]]](), dict[str, HeldOut | None]()
+    for each in tried:
+        name, wide = each.explanation.name, each.wider
+        gains[name] = gained = None if wide is None else held_out(wide, refined, len(tried))
+        if wide is not None and gained is not None and (order := _named(wide, each.explanation)):
+            named[name] = each, wide, order
+        else:
+            gains[name] = None
+    return [
+        _explained(problem, refined, *named[name], gained)
+        for name in accepted(gains)
+        if (gained := gains[name]) is not None
+    ]
 
 
 def rivals(found: Sequence[Explained]) -> list[Explained]:
     """Return the best explanation, and those that predict about as well: no chance tells them apart."""
-    return [one for one in found if found[0].diagnosis.deviance - one.diagnosis.deviance < EVIDENCE]
+    return [one for one in found if alike(found[0].diagnosis.deviance, one.diagnosis.deviance)]
 
 
 def likeliest(found: Sequence[Explained]) -> list[Explained]:
@@ -318,14 +330,11 @@ def keeps_mass(p: Parameter, value: float) -> bool:
     return value > p.low * (1 + LEAST_RISE)
 
 
-def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | None:
-    wide, of = tried.wider, tried.explanation
-    gained = None if wide is None else gain_of(wide, refined)
-    if wide is None or gained is None:
-        return None
-    order = _named(wide, of)
-    if not order:
-        return None
+def _explained(
+    problem: Problem, refined: Refined, tried: Tried, wide: WiderFit, order: Sequence[int], gained: HeldOut
+) -> Explained:
+    """Return an accepted hypothesis with these of its parameters."""
+    of = tried.explanation
     named = [wide.more[k] for k in order]
     elements = tuple(dict.fromkeys(e for p in named for e in p.elements))
     if of is PLAY:
@@ -336,15 +345,14 @@ def _explained(problem: Problem, refined: Refined, tried: Tried) -> Explained | 
         sizes = listed([_value(wide.more[k], wide.found[k]) for k in order])
     seen = (
         f"With {of.name} ({sizes}) the model predicts motion that it was not fitted to with chi2 "
-        f"{wide.prediction.chi2:.3g} instead of {gained.before:.3g}: {of.cause}."
+        f"{gained.after:.3g} instead of {gained.before:.3g}: {of.cause}."
     )
     alarm = Finding.alarm(seen, of.means, of.do.replace("{}", listed(elements)))
     kind = ZERO_CAUSES.get(named[0].kind, of.cause)
     cause = Diagnosis.of(kind, gained.share, gained.deviance, elements, alarm, wide.shift_of(refined))
     theta = np.concatenate([wide.fit.theta[: len(problem.space)], wide.found[order]])
-    return Explained(
-        of, cause, problem.with_more(named), theta, wide.fit.latency_s, wide.prediction.chi2, gained.before
-    )
+    wider = problem.with_more(named)
+    return Explained(of, cause, wider, theta, wide.fit.latency_s, gained.after, gained.before)
 
 
 def _value(p: Parameter, found: float) -> str:

@@ -14,7 +14,9 @@ import numpy as np
 from deal_hw.calib.data.parts import BEGIN_S, part_of, samples_in
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NOTICED, WINDOW_S
+from deal_hw.calib.fit.solver import correlated_samples
+from deal_hw.calib.hypotheses.judge import HeldOut
+from deal_hw.calib.hypotheses.thresholds import WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
 from deal_hw.sim.parameters import KIND_TABLE
@@ -71,21 +73,6 @@ class WiderFit:
         return np.asarray(moved / std)
 
 
-@dataclass(frozen=True, slots=True)
-class Gain:
-    """What more parameters explain of motion that was not fitted.
-
-    Attributes:
-        share: Share of the squared residual.
-        deviance: Gain in deviance.
-        before: Mean squared residual over the noise variance without them.
-    """
-
-    share: float
-    deviance: float
-    before: float
-
-
 def fit_wider(
     problem: Problem, more: Sequence[Parameter], seconds: float = BEGIN_S, start: Member | None = None
 ) -> WiderFit | None:
@@ -125,10 +112,15 @@ def wider_cost(problem: Problem, fits: bool, more: int = 0) -> float:
     return 6.0 * members * periods * (2 if fits else 1) + 2.0 * predictions
 
 
-def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
-    """Return what a wider fit gains over the model as it is; None where that is too little.
+def held_out(wide: WiderFit, refined: Refined, asked: int = 1) -> HeldOut | None:
+    """Return what a wider fit gains over the model as it is; None where no judge would accept that.
 
-    The fit without the parameters, ``refined``, has used all recordings.
+    The model as it is gets two chances, of which the better one counts.
+
+    Args:
+        wide: The wider fit.
+        refined: The fit without its parameters, which has used all recordings.
+        asked: How many hypotheses the judge asks.
     """
     problem, fit, prediction = wide.of, wide.fit, wide.prediction
     seen, unseen = (
@@ -136,22 +128,22 @@ def gain_of(wide: WiderFit, refined: Refined) -> Gain | None:
     )
     length = prediction.shooting.length
 
-    def gained(without: Refined) -> Gain | None:
-        share = 1 - prediction.chi2 / without.chi2
-        deviance = -without.normal.count * float(np.log(prediction.chi2 / without.chi2))
-        enough = deviance > EVIDENCE and share > NOTICED
-        return Gain(share, deviance, without.chi2) if enough else None
+    def gained(theta: FloatArray, latency_s: float) -> HeldOut:
+        without = at_parameters(unseen, theta, latency_s, length)
+        # Neighbouring residuals of a wrong model are alike, and count once for each correlation time.
+        count = without.normal.count / correlated_samples(without.normal.residual, length)
+        return HeldOut(without.chi2, prediction.chi2, count)
 
     try:
-        without = at_parameters(unseen, refined.theta, refined.latency_s, length)
-        if gained(without) is None:
+        found = gained(refined.theta, refined.latency_s)
+        if not found.promises(asked):
             return None
         # The wider fit may have left another minimum; a fit from there without more then predicts as well.
         bare = refine(seen, fit.theta[: len(problem.space)], fit.latency_s, (WINDOW_S,))
-        again = at_parameters(unseen, bare.theta, bare.latency_s, length)
+        again = gained(bare.theta, bare.latency_s)
     except (InsufficientDataError, CalibrationError):
         return None
-    return gained(again if again.chi2 < without.chi2 else without)
+    return min(found, again, key=lambda each: each.before)
 
 
 def motion(problem: Problem) -> tuple[FloatArray, FloatArray]:

@@ -34,8 +34,9 @@ from deal_hw.calib.fit.output_error import (
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
 from deal_hw.calib.hypotheses.candidates import Candidate, Judged, Outcome, ranked
 from deal_hw.calib.hypotheses.hypothesis import Hypothesis, values_in_words
+from deal_hw.calib.hypotheses.judge import HeldOut, accepted
 from deal_hw.calib.hypotheses.laws import LAG
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE, MOST_LAWS, NOTICED, RIVAL
+from deal_hw.calib.hypotheses.thresholds import MOST_LAWS, RIVAL
 from deal_hw.calib.hypotheses.trials import applicable
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit
@@ -123,23 +124,18 @@ class ScreenedLaws:
 
     Attributes:
         chosen: Those that the folds compare.
-        shares: Share of the squared residual that each explains there, by the law's name [-].
-        count: Number of independent residuals: samples over the residuals' correlation time.
+        gains: What each gains there, by the law's name.
+        asked: How many were asked; some fits with a law diverge.
     """
 
     chosen: Sequence[LawCandidate] = ()
-    shares: Mapping[str, float] = field(default_factory=dict)
-    count: float = 0.0
-
-    def deviance(self, name: str) -> float:
-        """Return the held-out deviance that a law gains."""
-        return -self.count * float(np.log(1 - self.shares[name]))
+    gains: Mapping[str, HeldOut] = field(default_factory=dict)
+    asked: int = 0
 
     def promising(self) -> list[str]:
-        """Return the laws that gain more than chance, and about as much as the best, best first."""
-        order = sorted(self.shares, key=lambda name: -self.shares[name])[:MOST_FOLDED]
-        enough = [n for n in order if self.deviance(n) > EVIDENCE and self.shares[n] > NOTICED]
-        return [n for n in enough if self.deviance(n) > RIVAL * self.deviance(order[0])]
+        """Return the laws that the judge accepts and that gain about as much as the best, best first."""
+        names = accepted(self.gains, self.asked)[:MOST_FOLDED]
+        return [n for n in names if self.gains[n].deviance > RIVAL * self.gains[names[0]].deviance]
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,16 +178,18 @@ class LawfulChoice:
     def candidates(self, laws: ScreenedLaws) -> list[Candidate]:
         """Return all laws that were fitted to a part of the recordings; those of the folds by these."""
         rows, chosen = list[Candidate](), {law.explanation.name for law in laws.chosen}
-        for name, share in laws.shares.items():
+        for name, gain in laws.gains.items():
             judged: Judged = "fit"
+            share = gain.share
             outcome: Outcome = "not named" if name in chosen else "chance"
             if self.law is not None and name == self.law.explanation.name:
                 judged, outcome = "folds", "taken"
                 share = 1 - float(np.exp(2 * np.mean(np.log(self.ratios))))
             elif any(name in of for of in self.lost):
                 judged, outcome = "folds", "chance"
-            deviance = laws.deviance(name)
-            row = Candidate(explanation=name, judged=judged, outcome=outcome, deviance=deviance, share=share)
+            row = Candidate(
+                explanation=name, judged=judged, outcome=outcome, deviance=gain.deviance, share=share
+            )
             rows.append(row)
         return rows
 
@@ -379,7 +377,7 @@ def screened_laws(
         return ScreenedLaws()
     left_out, seen = fold_masks(problem, 2)
     part, rest = problem.part(seen), problem.part(left_out)
-    recipe, laws, shares = Recipe(seconds=seconds[0], iterations=SCREEN_ITERATIONS), [], dict[str, float]()
+    recipe, laws, gains = Recipe(seconds=seconds[0], iterations=SCREEN_ITERATIONS), [], dict[str, HeldOut]()
     with run.check(EXPLANATIONS):
         try:
             without = fit_output_error(part, *fit, recipe).member
@@ -394,9 +392,9 @@ def screened_laws(
             rmse = prediction_rmse(rest.with_more(more), [member], seconds[0])[0]
             if not np.isfinite(rmse).all():
                 continue
-            shares[law.name] = 1 - float(np.mean((rmse / rms) ** 2))
+            gains[law.name] = HeldOut(1.0, float(np.mean((rmse / rms) ** 2)), count)
             laws.append(LawCandidate(law, more, seconds, member))
-    found = ScreenedLaws((), shares, count)
+    found = ScreenedLaws((), gains, len(can))
     chosen = found.promising()
     return dataclasses.replace(found, chosen=[law for law in laws if law.explanation.name in chosen])
 

@@ -262,7 +262,7 @@ class OutputErrorFits(Fits):
         if found is not None and judged[1] is not None:
             known, facts["diagnosis"] = checks.with_causes(judged[0], judged[1], known, found.causes)
             # The cross-validation has judged laws already.
-            rows += [row for row in found.candidates if row.explanation not in screened.shares]
+            rows += [row for row in found.candidates if row.explanation not in screened.gains]
         if rows:
             facts["candidates"] = [row.to_json() for row in ranked(rows)]
         pairs = confounded(problem, fit.normal.hessian / known.inflation)

@@ -47,7 +47,7 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | Calibrat
     from deal_hw.calib.hypotheses.evidence import evidence
     from deal_hw.calib.hypotheses.recording_zeros import common_zeros, named_zeros, own_zeros, zeros_of
     from deal_hw.calib.hypotheses.signatures import zeros
-    from deal_hw.calib.hypotheses.wider_models import fit_wider, gain_of, wider_cost
+    from deal_hw.calib.hypotheses.wider_models import fit_wider, held_out, wider_cost
 
     problem, names = run.problem, recordings_of(e.name for e in run.problem.episodes)
     shared = [] if problem.noise_free else zeros(problem)
@@ -69,7 +69,7 @@ def with_own_zeros(run: CalibrationRun, local: Refined) -> FitOutcome | Calibrat
         wider = fit_wider(problem, more, seconds=2.0 * len(names) if differ else 0.0, start=start)
         if wider is None or wider.prediction.chi2 > MISMATCH_CHI2:
             return run
-        gained = gain_of(wider, local)
+        gained = held_out(wider, local)
         if gained is None or gained.before - wider.prediction.chi2 < DECISIVE * (gained.before - 1):
             return run
     wide = dataclasses.replace(run, problem=problem.with_more(more))

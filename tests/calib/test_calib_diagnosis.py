@@ -490,7 +490,7 @@ def test_a_mass_is_named_with_its_size(monkeypatch: pytest.MonkeyPatch) -> None:
         return weighs(problem, fit, found[0], (), all_allowed)
 
     assert said(1.5) and not said(0.2)
-    monkeypatch.setattr(diagnosis, "gain_of", lambda *_: None)
+    monkeypatch.setattr(diagnosis, "held_out", lambda *_: None)
     assert not said(1.5)
 
 

@@ -250,7 +250,7 @@ def test_friction_by_load_is_chosen_where_dry_friction_has_taken_its_place(tmp_p
     found = screened_laws(small_run(problem), problem, [fit.member], (0.4, 2.0))
     (law,) = found.chosen
     assert law.explanation.name == "friction that grows with load"
-    shares = dict(found.shares)
+    shares = {name: gain.share for name, gain in found.gains.items()}
     of_load = shares.pop(law.explanation.name)
     assert of_load > 0.3 and shares.pop("friction that grows with the motor's torque") < 0.5 * of_load
     assert max(shares.values()) < 1 / 7
