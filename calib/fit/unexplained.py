@@ -17,7 +17,7 @@ class Unexplained(Finding):
 
     Attributes:
         facts: What the residuals are, such as "3.0 times the sensor's noise".
-        place: A sentence on where they lie, if all known causes were asked for and none explains them.
+        place: Sentences on why no known cause is named, and where they lie.
     """
 
     facts: tuple[str, ...] = ()
@@ -28,8 +28,7 @@ class Unexplained(Finding):
         """Return the alarm."""
         if place:
             found = Finding.alarm(
-                f"Residuals are {' and '.join(facts)}. None of the known causes explains them. "
-                f"{place.removesuffix('.')}.",
+                f"Residuals are {' and '.join(facts)}. {place.removesuffix('.')}.",
                 "The model does not explain the recording: it lacks something that the robot has, or a "
                 "sensor is wrong there: blind or bent in a part of its range, or with another scale. The "
                 "intervals count all of it as noise.",

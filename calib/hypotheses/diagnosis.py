@@ -1,9 +1,10 @@
 """Causes of an unexplained residual and the next repair, chosen on motion that was not fitted.
 
-Three kinds of evidence use one statistic. Laws that the model lacks are candidate models (`.explain`):
+Three kinds of evidence use one statistic. Laws that the model lacks are candidate models (`.trials`):
 refitted on a part of the recordings, they predict the rest. Other causes have signatures, which a regression
 adds to the parameters (`.evidence`). A random delay predicts no sample, but where the residual is large:
-beside random forces of constant size, it must make the residual likelier.
+beside random forces of constant size, it must make the residual likelier. From a fit far from the recordings
+no cause is named: effects around it are not the robot's.
 """
 
 from __future__ import annotations
@@ -56,12 +57,6 @@ from deal_hw.types import FloatArray
 ALIKE = 0.8
 """Least explained share of a named body's mass, relative to the best one's [-]."""
 
-REVERSALS = 0.2
-"""Share that play must explain in a poor fit [-]."""
-
-ALONE = 2.0
-"""Least ratio of play's deviance to that of each other signature in a poor fit [-]."""
-
 BURST_PART = 0.05
 """Bursts occupy at most this part of the time [-]."""
 
@@ -98,18 +93,19 @@ def diagnose(
     known = functools.cache(lambda: evidence(problem, refined))
     tried = try_explanations(problem, refined, allows, tried, known)
     laws = explained(problem, refined, tried)
-    wider, rows = [one.diagnosis for one in likeliest(laws)], list[Candidate]()
-    found, effects = [one for one in wider if one.share >= DECISIVE], list[Diagnosis]()
+    # A law is named from the fit that has it.
+    wider = [one.diagnosis for one in likeliest(laws) if one.chi2 <= NEAR_CHI2]
+    found, rows = [one for one in wider if one.share >= DECISIVE], list[Candidate]()
     unsure = np.zeros(0)
     if not found:
-        wider = [one for one in wider if supported(one.share, refined.chi2)]
-        named = {one.code for one in wider}
-        effects = [one for one in name_causes(known(), refined.chi2, len(tried)) if one.code not in named]
-        effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
-        found = sorted((*effects, *wider), key=lambda f: -f.deviance)
-        again = {one.explanation.name for one in tried}
-        rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
+        found = wider
         if refined.chi2 <= NEAR_CHI2:
+            named = {one.code for one in wider}
+            effects = [e for e in name_causes(known(), refined.chi2, len(tried)) if e.code not in named]
+            effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
+            found = sorted((*effects, *wider), key=lambda f: -f.deviance)
+            again = {one.explanation.name for one in tried}
+            rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
             unsure = unnamed_shift(known(), {one.code for one in found})
     rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
     return Diagnosed(tuple(found), ranked(rows), unsure)
@@ -132,16 +128,16 @@ def weighs(
     return wide is not None and keeps_mass(body, wide.found[0]) and held_out(wide, refined) is not None
 
 
-def supported(share: float, chi2: float) -> bool:
-    """Return whether a cause that explains a share of a residual is more than an accident of a poor fit."""
-    return share >= DECISIVE or chi2 * (1 - share) <= NEAR_CHI2
-
-
 def name_causes(known: Evidence, chi2: float = 1.0, others: int = 0) -> list[Diagnosis]:
     """Return the causes that evidence supports, best first; each is tested together with those before it.
 
-    ``chi2`` is the fit's. Causes with signatures are :func:`supported` together, or none is named.
+    Args:
+        known: The evidence.
+        chi2: The fit's; above :data:`~deal_hw.calib.hypotheses.thresholds.NEAR_CHI2` none is named.
+        others: How many hypotheses were asked in other ways.
     """
+    if chi2 > NEAR_CHI2:
+        return []
     found: list[Diagnosis] = []
     taken: list[Signature] = []
     groups = groups_of(known.found)
@@ -160,14 +156,9 @@ def name_causes(known: Evidence, chi2: float = 1.0, others: int = 0) -> list[Dia
         groups = [g for g in groups if g[0].cause != group[0].cause]
         if group[0].cause == "zero":
             groups = [g for g in groups if g[0].cause != "load"]
-    if found and not supported(1 - float(np.prod([1 - one.share for one in found])), chi2):
-        found, taken = [], []
-        if (play := _alone_at_reversals(known)) is not None:
-            # A delay of its own for each command would take up a part of any residual.
-            return [play]
     left = chi2 * float(np.prod([1 - one.share for one in found]))
     varying, bursts = _varying_delay(known, taken), _bursts(known, known.residual(taken))
-    if varying is not None and supported(varying.share, left):
+    if varying is not None:
         found.append(varying)
     # Bursts predict nothing, and are chosen for their size. So only what they leave can support them.
     if bursts is not None and left * (1 - bursts.share) <= BURST_LEFT:
@@ -215,22 +206,6 @@ def _simplest(groups: Sequence[Sequence[Signature]], gains: Sequence[float]) -> 
         load = causes.index("load")
         return load if alike(gains[best], gains[load]) else best
     return best
-
-
-def _alone_at_reversals(known: Evidence) -> Diagnosis | None:
-    """Return play as the cause of a poor fit's residual, if no other signature comes near to it.
-
-    Effects of masses and friction are those around the fit, which is not the robot. Play acts where the
-    measured motion or load turns round, wherever the parameters are.
-    """
-    groups = [some for group in groups_of(known.found) if (some := _possible(known, [], group))]
-    rivals = [known.gain([], group) for group in groups if group[0].cause != "backlash"]
-    for group in (group for group in groups if group[0].cause == "backlash"):
-        gain = known.gain([], group)
-        share = 1 - float(np.exp(-gain / known.count))
-        if share >= REVERSALS and gain >= ALONE * max(rivals, default=0.0):
-            return _cause_diagnosis(known, [], group, share, gain)
-    return None
 
 
 def _possible(known: Evidence, taken: Sequence[Signature], group: Sequence[Signature]) -> list[Signature]:

@@ -45,7 +45,7 @@ from deal_hw.calib.hypotheses.random_errors import (
     SeenErrors,
     at_least,
 )
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NEAR_CHI2
 from deal_hw.calibration import Z90
 from deal_hw.errors import InsufficientDataError
 from deal_hw.findings import Finding
@@ -235,7 +235,7 @@ def fit_delays(problem: Problem, refined: Refined, least: float) -> DelaysAsked:
     most_s = min(MOST_SPACED * command_spacing_s(problem), most_delay_std_s(problem))
     if found is not None and min(found.gain, likely.gain) > least and likely.std_s <= most_s:
         delays = _fitted(problem.with_command_delays(none), asked, found, likely.std_s)
-        if delays is not None:
+        if delays is not None and delays.fit.chi2 <= NEAR_CHI2:
             return DelaysAsked(replace(delays, before=refined))
     # Shorter windows say less of the values, so no fit of them takes the place of one of longer ones. A
     # residual above the noise is an error of the model that is not random: on a real pendulum with a chi2 of

@@ -35,7 +35,7 @@ from deal_hw.calib.fit.residual import Point, Shooting, WindowRows
 from deal_hw.calib.fit.unexplained import Unexplained
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.diagnosis import all_allowed, diagnose
-from deal_hw.calib.hypotheses.thresholds import MOST_ALARMS
+from deal_hw.calib.hypotheses.thresholds import MOST_ALARMS, NEAR_CHI2
 from deal_hw.calib.hypotheses.trials import Allows, Tried
 from deal_hw.calib.validation.residual_place import residual_place
 from deal_hw.calib.validation.settings import Validation
@@ -55,6 +55,13 @@ SPLIT_FALSE_ALARMS = 0.05
 """Probability that the split-half check flags any parameter of a right model [-]: among many parameters,
 intervals of some halves always miss each other."""
 
+
+UNKNOWN = "None of the known causes explains them."
+TOO_FAR = (
+    f"That is too far to name a cause: the limit is {np.sqrt(NEAR_CHI2):.0f} times the noise, and no known "
+    "law brings the fit there."
+)
+"""Why no cause is named."""
 
 HALVES = "two halves of the data"
 PHYSICS_STEP = "the physics step"
@@ -237,10 +244,10 @@ def judge(
 def with_step(problem: Problem, refined: Refined, known: Uncertainty) -> tuple[Uncertainty, dict[str, Any]]:
     """Check the physics step; return the updated uncertainty and the result as plain JSON values.
 
-    ``refined`` has linearised residuals.
+    ``refined`` has linearised residuals. Far from the recordings a finer step is no reason for an alarm.
     """
     step = check_step(problem, refined)
-    alarms = step_alarm(known, step)
+    alarms = step_alarm(known, step) if refined.chi2 <= NEAR_CHI2 else ()
     return counted(problem, known, step).with_alarms(last=alarms), step.to_json()
 
 
@@ -249,11 +256,12 @@ def with_causes(
 ) -> tuple[Uncertainty, list[dict[str, Any]]]:
     """Put alarms for causes of the residual first; return all causes as plain JSON values, too.
 
-    Where there is none, the alarm says so, and where the residual lies.
+    Where there is none, the alarm says why, and where the residual lies.
     """
     alarms: list[Finding] = list(found[:MOST_ALARMS])
     if not found and refined.chi2 > MISMATCH_CHI2:
-        alarms = [Unexplained.larger(refined.chi2, place=residual_place(problem, refined))]
+        why = UNKNOWN if refined.chi2 <= NEAR_CHI2 else TOO_FAR
+        alarms = [Unexplained.larger(refined.chi2, place=f"{why} {residual_place(problem, refined)}")]
     return biased(problem, known, found).with_alarms(*alarms), [f.to_json() for f in found]
 
 

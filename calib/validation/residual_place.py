@@ -168,7 +168,7 @@ def residual_place(problem: Problem, refined: Refined) -> str:
     channel = f"; {most}" if len(of_channel) > 1 else ""
     if found is None:
         alone = len(of_channel) > 1 and of_channel[worst] >= CHANNEL_SHARE
-        return f"{most}." if alone else "It is spread over the motion."
+        return f"{most}." if alone else f"It is spread over the motion{channel}."
     stretch, where = found
     return (
         f"{percent(stretch.share)} of its square lies {where}, with {percent(stretch.samples)} of the "

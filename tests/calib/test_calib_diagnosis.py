@@ -17,12 +17,13 @@ from deal_hw.calib.data.folds import fold_numbers
 from deal_hw.calib.data.parts import part_of
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
-from deal_hw.calib.fit.refinement import refine
+from deal_hw.calib.fit.refinement import Refined, refine
 from deal_hw.calib.fit.residual import WindowRows
 from deal_hw.calib.hypotheses import diagnosis
 from deal_hw.calib.hypotheses.cause_words import Diagnosis, SearchedKinds
 from deal_hw.calib.hypotheses.diagnosis import all_allowed, name_causes, unnamed_shift, weighs
 from deal_hw.calib.hypotheses.evidence import Evidence, evidence, unsure_shift
+from deal_hw.calib.hypotheses.laws import PLAY
 from deal_hw.calib.hypotheses.signatures import (
     Cause,
     Signature,
@@ -31,8 +32,8 @@ from deal_hw.calib.hypotheses.signatures import (
     place_in_play,
     signatures,
 )
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE
-from deal_hw.calib.hypotheses.trials import explained, try_explanations
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NEAR_CHI2
+from deal_hw.calib.hypotheses.trials import Explained, Tried, explained, try_explanations
 from deal_hw.calib.hypotheses.wider_models import fit_wider, zero_parameters
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes, with_unsure
 from deal_hw.calib.validation.residual_place import (
@@ -44,6 +45,7 @@ from deal_hw.calib.validation.residual_place import (
     size_over,
 )
 from deal_hw.calibration import Z90
+from deal_hw.findings import Finding
 from deal_hw.testing.plain_robots import make_robot
 from deal_hw.types import FloatArray
 
@@ -259,32 +261,30 @@ def test_a_joint_without_a_drive_has_no_gear(small_problem: Callable[..., Proble
     assert geared == {"cart"}
 
 
-def test_no_cause_stands_where_most_of_a_poor_fit_stays_unexplained() -> None:
-    """A load beside four times its square that no cause explains: named near the noise, not far above it."""
-    load = moved_by(np.full((WINDOWS, SAMPLES), 0.3))
-    strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
-    known = knee_evidence(load + 2 * np.std(load) / np.std(strange) * strange)
-    assert [f.code for f in name_causes(known, 5.0)] == ["load"]
-    assert name_causes(known, 100.0) == []
-    # What explains most of it stands, however large it is.
-    assert [f.code for f in name_causes(knee_evidence(load), 100.0)] == ["load"]
+def test_from_a_fit_far_from_the_noise_no_signature_is_named() -> None:
+    """A load that explains nearly all is one near the noise; far from it the fit is not the robot."""
+    known = knee_evidence(moved_by(np.full((WINDOWS, SAMPLES), 0.3)))
+    assert [f.code for f in name_causes(known, NEAR_CHI2)] == ["load"]
+    assert name_causes(known, 1.01 * NEAR_CHI2) == []
 
 
-def test_play_alone_stands_in_a_poor_fit() -> None:
-    """It acts where the measured motion turns round, wherever the parameters are; a mass there is a guess."""
-    known = knee_evidence(np.zeros((WINDOWS, SAMPLES)))
-    (play,) = [s for s in known.found if s.cause == "backlash"]
-    effect = play.columns[0][..., 0]
-    effect = effect * 20 * STD / np.std(effect)
-    strange = np.sin(np.arange(SAMPLES) * 2.1) * np.ones((WINDOWS, 1))
-    strange *= np.std(effect) / np.std(strange)
-    (found,) = name_causes(knee_evidence(effect + 0.8 * strange), 100.0)
-    assert found.code == "backlash" and 0.3 < found.share < 0.5
-    # With another cause near to it nothing is named, nor where it explains little.
-    load = moved_by(np.full((WINDOWS, SAMPLES), 1.0))
-    near = 0.7 * load * np.std(effect) / np.std(load)
-    assert name_causes(knee_evidence(effect + near + 1.5 * strange), 100.0) == []
-    assert name_causes(knee_evidence(effect + 1.6 * strange), 100.0) == []
+@pytest.mark.parametrize(("after", "named"), [(NEAR_CHI2, True), (1.01 * NEAR_CHI2, False)])
+def test_a_law_is_named_from_the_fit_that_has_it(
+    after: float,
+    named: bool,
+    noisy_problem: Problem,
+    noisy_refined: Refined,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Around a fit with a chi2 of 100 a law that leaves 9 is a cause, and one that leaves more is none."""
+    poor = with_rows(dataclasses.replace(noisy_refined, chi2=100.0))
+    alarm = Finding.alarm("With play it is better.", "It is play.", "Repair it.")
+    cause = Diagnosis.of("backlash", 1 - after / 100, 900.0, ("cart",), alarm)
+    law = Explained(PLAY, cause, noisy_problem, poor.theta, 0.0, after, 100.0)
+    monkeypatch.setattr(diagnosis, "explained", lambda *_: [law])
+    monkeypatch.setattr(diagnosis, "evidence", lambda *_: pytest.fail("effects were asked for"))
+    tried = [Tried(PLAY, noisy_problem, 0.0, None)]
+    assert diagnosis.diagnose(noisy_problem, poor, tried).causes == ((cause,) if named else ())
 
 
 def test_a_residual_without_a_cause_is_placed(small_problem: Callable[..., Problem]) -> None:
@@ -310,7 +310,9 @@ def test_a_residual_without_a_cause_is_placed(small_problem: Callable[..., Probl
     known, causes = with_causes(problem, fit, uncertainty_at(problem, fit), ())
     assert causes == []
     seen = known.alarms[0].seen
-    assert "None of the known causes" in seen and "10.0 times" in seen
+    assert "10.0 times" in seen and "too far to name a cause: the limit is 3 times the noise" in seen
+    near = with_causes(problem, dataclasses.replace(fit, chi2=4.0), uncertainty_at(problem, fit), ())[0]
+    assert "None of the known causes explains them." in near.alarms[0].seen
     assert "where cart is between" in seen and f"and {cart.max():.2f} m" in seen
     assert "100 % of its square is in cart" in seen
 

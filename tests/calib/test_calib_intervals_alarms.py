@@ -13,7 +13,7 @@ def test_alarms_of_unexplained_residuals_become_one() -> None:
     window = " over 0.4 s from fitted start states"
     found = as_one(
         [
-            Unexplained.larger(9.0, place="It is spread over channels and positions."),
+            Unexplained.larger(9.0, place="No cause is known. It is spread over channels."),
             Unexplained.of([autocorrelated(23.04)]),
             BOUND,
             Unexplained.larger(9.0, window),
@@ -22,8 +22,7 @@ def test_alarms_of_unexplained_residuals_become_one() -> None:
     assert [alarm.code for alarm in found] == ["unexplained", ""] and found[1] == BOUND
     assert found[0].seen == (
         "Residuals are autocorrelated over 23.0 samples (the sensor's noise is not) and 3.0 times the "
-        "sensor's noise over 0.4 s from fitted start states. None of the known causes explains them. It is "
-        "spread over channels and positions."
+        "sensor's noise over 0.4 s from fitted start states. No cause is known. It is spread over channels."
     )
     assert "a sensor is wrong there" in found[0].means and "held-out error" in found[0].do
 
