@@ -101,10 +101,10 @@ def law_candidates(
         taken: Name of the law that is in the result.
         named: Names of those that an alarm has.
     """
-    gained, named = {one.explanation.name: one.diagnosis for one in found}, set(named)
+    gained, named = {one.hypothesis.name: one.diagnosis for one in found}, set(named)
     tried, rows = list(tried), []
     for one in tried:
-        name = one.explanation.name
+        name = one.hypothesis.name
         if one.wider is None:
             rows.append(_by_effect(name, one.screened, len(tried)))
             continue

@@ -47,7 +47,7 @@ from deal_hw.calib.hypotheses.trials import (
     fits_wider_models,
     keeps_mass,
     likeliest,
-    try_explanations,
+    try_hypotheses,
 )
 from deal_hw.calib.hypotheses.wider_models import fit_wider, held_out, wider_cost
 from deal_hw.calibration import listed, percent
@@ -91,7 +91,7 @@ def diagnose(
         allows: Which fits of wider models may be made.
     """
     known = functools.cache(lambda: evidence(problem, refined))
-    tried = try_explanations(problem, refined, allows, tried, known)
+    tried = try_hypotheses(problem, refined, allows, tried, known)
     laws = explained(problem, refined, tried)
     # A law is named from the fit that has it.
     wider = [one.diagnosis for one in likeliest(laws) if one.chi2 <= NEAR_CHI2]
@@ -104,10 +104,10 @@ def diagnose(
             effects = [e for e in name_causes(known(), refined.chi2, len(tried)) if e.code not in named]
             effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
             found = sorted((*effects, *wider), key=lambda f: -f.deviance)
-            again = {one.explanation.name for one in tried}
+            again = {one.hypothesis.name for one in tried}
             rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
             unsure = unnamed_shift(known(), {one.code for one in found})
-    rows += law_candidates(tried, laws, named=[o.explanation.name for o in laws if o.diagnosis in found])
+    rows += law_candidates(tried, laws, named=[o.hypothesis.name for o in laws if o.diagnosis in found])
     return Diagnosed(tuple(found), ranked(rows), unsure)
 
 

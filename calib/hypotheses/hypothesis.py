@@ -62,8 +62,8 @@ class Hypothesis:
         return self.far or chi2 <= FAR_CHI2
 
     def worth_a_fit(self, gain: float, least: float) -> bool:
-        """Return whether it is fitted where its linearised effect gains so much deviance, or ``least``."""
-        return self.hidden or gain > least
+        """Return whether it is fitted where its linearised effect gains a deviance, of ``least`` or more."""
+        return self.hidden or gain >= least
 
     def cost(self, problem: Problem, more: Sequence[Parameter]) -> float:
         """Return about how many physics steps a fit with its parameters takes, and its judgement."""

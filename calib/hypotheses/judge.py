@@ -21,7 +21,7 @@ Asked = TypeVar("Asked")
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class UnseenGain:
     """What a hypothesis gains on motion that its fit did not see.
 
     Attributes:
@@ -58,7 +58,7 @@ def needed(asked: int, number: int = 1) -> float:
     return 2.0 / TEMPER * float(np.log(max(asked, number) / (number * FALSE_DISCOVERIES)))
 
 
-def accepted(gains: Mapping[Asked, HeldOut | None], asked: int | None = None) -> list[Asked]:
+def accepted(gains: Mapping[Asked, UnseenGain | None], asked: int | None = None) -> list[Asked]:
     """Return the hypotheses that predict better than the model without them, best first.
 
     Args:

@@ -23,7 +23,8 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.hypotheses.candidates import Candidate
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NOTICED_CORRECTION, WINDOW_S
+from deal_hw.calib.hypotheses.judge import UnseenGain, needed
+from deal_hw.calib.hypotheses.thresholds import NOTICED_CORRECTION, WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
@@ -195,7 +196,8 @@ class FoundError:
     def confirmed(self, theta: FloatArray, latency_s: float) -> bool:
         """Return whether an estimate predicts the original recordings no better, at a latency [s]."""
         chi2 = _predicted(self.test, theta, latency_s, self.length)
-        return _decides(chi2, self.chi2, _samples(self.test, self.length))
+        asked = sum(1 for _ in shared_errors(self.test))
+        return _decides(UnseenGain(chi2, self.chi2, _samples(self.test, self.length)), asked)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -338,25 +340,27 @@ def find_shared_error(
         found[error] = _fitted(problem, error.undo, seen, unseen, length, hopeless)[1]
     check = SharedErrorCheck(tried=len(found), of=min(len(ranked), TRIED))
     best = min(found, key=lambda e: found[e], default=None)
-    if best is None or not _decides(as_recorded, found[best], count):
+    if best is None:
+        return check
+    gained = UnseenGain(as_recorded, found[best], count)
+    if not _decides(gained, len(ranked)):
         return check
     alike = sorted((e for e in found if found[e] <= ALIKE * found[best]), key=lambda e: found[e])
-    deviance = count * math.log(as_recorded / found[best])
-    error_found = FoundError(tuple(alike), found[best], as_recorded, deviance, test, length)
+    error_found = FoundError(tuple(alike), found[best], as_recorded, gained.deviance, test, length)
     return dataclasses.replace(check, found=error_found)
 
 
-def _decides(before: float, after: float, count: int) -> bool:
-    """Return whether the prediction improves so much that the candidate is named.
+def _decides(gained: UnseenGain, asked: int) -> bool:
+    """Return whether the prediction improves so much that the best of the corrections asked is named.
 
     Only noise may remain: from a fit that explains neither, no cause can be named. Residuals far below the
     noise need no explanation.
     """
-    if before <= NEGLIGIBLE_CHI2 or not after <= MISMATCH_CHI2:
+    if gained.before <= NEGLIGIBLE_CHI2 or not gained.after <= MISMATCH_CHI2:
         return False
-    if not after < (1 - NOTICED_CORRECTION) * before:
+    if not gained.share > NOTICED_CORRECTION:
         return False
-    return not np.isfinite(before) or count * math.log(before / after) > EVIDENCE
+    return not np.isfinite(gained.before) or gained.deviance >= needed(asked)
 
 
 def _samples(test: Problem, length: int) -> int:

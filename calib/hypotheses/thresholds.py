@@ -20,17 +20,17 @@ this one."""
 
 EVIDENCE: Final = 20.0
 """Least difference in deviance that no chance makes [-]: odds of 22,000 to 1. Of two fits of the same motion
-that ended in different minima, of two hypotheses, of random errors by the likelihood of the residual that
-they explain, and of a correction of recordings. A hypothesis that predicts unseen motion is accepted at
-:data:`FALSE_DISCOVERIES` instead: how many were asked counts there."""
+that ended in different minima, of two hypotheses, and of random errors by the likelihood of the residual that
+they explain. A hypothesis that predicts unseen motion is accepted at :data:`FALSE_DISCOVERIES` instead, where
+it counts how many were asked."""
 
 NOTICED: Final = 0.03
 """Least share of the held-out squared residual that a hypothesis explains [-]. Long recordings show effects
 that no owner would notice: 3 % of the square is 1.5 % of the error."""
 
 NOTICED_CORRECTION: Final = 0.2
-"""The same of a correction of the recordings [-], which must leave only noise. So what it explains is at most
-a fifth of the noise where the share is smaller, and to doubt a recording takes more."""
+"""The same of a correction of the recordings [-]. It must leave only noise, so a smaller share means that
+little more than noise was there before, which is no reason to doubt a recording."""
 
 DECISIVE: Final = 0.5
 """Share explained from which other causes are asked for only after its repair [-]: it is more than all others

@@ -1,6 +1,6 @@
-"""Which explanation of a residual predicts motion that it was not fitted to, and by how much.
+"""Which hypothesis on a residual predicts motion that it was not fitted to, and by how much.
 
-All explanations are screened by their linearised effect around the fit without them, fitted on some windows
+All hypotheses are screened by their linearised effect around the fit without them, fitted on some windows
 and compared on the others. Those that gain most are fitted as models of their own, to a part of the
 recordings, and compared by what they predict of the rest. The best one is the robot if only noise is left.
 """
@@ -17,11 +17,17 @@ import numpy.typing as npt
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2
 from deal_hw.calib.fit.refinement import Refined
-from deal_hw.calib.fit.residual import Point, Shooting
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
 from deal_hw.calib.hypotheses.evidence import Evidence, evidence, groups_of
-from deal_hw.calib.hypotheses.hypothesis import SHAPES, Hypothesis, off_value, one_sided, sized, tried_value
-from deal_hw.calib.hypotheses.judge import HeldOut, accepted, alike, needed
+from deal_hw.calib.hypotheses.hypothesis import (
+    SHAPES,
+    Hypothesis,
+    off_value,
+    one_sided,
+    sized,
+    tried_value,
+)
+from deal_hw.calib.hypotheses.judge import UnseenGain, accepted, alike, needed
 from deal_hw.calib.hypotheses.laws import HYPOTHESES, LIMITS, PLAY, ZERO_CAUSES, other_masses
 from deal_hw.calib.hypotheses.signatures import Signature, whitened_changes
 from deal_hw.calib.hypotheses.thresholds import DECISIVE, FAR_CHI2, RIVAL, SURE
@@ -43,16 +49,16 @@ LEAST_RISE = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """An explanation that was screened, and fitted where that promised something.
+    """A hypothesis that was screened, and fitted where that promised something.
 
     Attributes:
-        explanation: The explanation.
+        hypothesis: The hypothesis.
         of: The recordings, without it.
         screened: Gain in held-out deviance of its linearised effect [-].
         wider: Its fit; None where it was not fitted, or could not be.
     """
 
-    explanation: Hypothesis
+    hypothesis: Hypothesis
     of: Problem
     screened: float
     wider: WiderFit | None
@@ -60,19 +66,19 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """An explanation that predicts better than the model does without it.
+    """A hypothesis that predicts better than the model does without it.
 
     Attributes:
-        explanation: The explanation.
+        hypothesis: The hypothesis.
         diagnosis: It as the cause of the residual.
         problem: The recordings, with its parameters that are sure.
         theta: The fit's values of these parameters.
         latency_s: Its latency [s].
         chi2: Mean squared residual over the noise variance, of motion that was not fitted.
-        before: The same without the explanation.
+        before: The same without the hypothesis.
     """
 
-    explanation: Hypothesis
+    hypothesis: Hypothesis
     diagnosis: Diagnosis
     problem: Problem
     theta: FloatArray
@@ -96,7 +102,7 @@ class Explained:
         return float(np.sqrt(np.mean((moved / own.width) ** 2)))
 
     def shift_to(self, other: Explained) -> FloatArray:
-        """Return the change of the values and the latency [s] if another explanation is true, (K + 1,).
+        """Return the change of the values and the latency [s] if another hypothesis is true, (K + 1,).
 
         Own values go to those of the other one, and further ones to where they have no effect.
         """
@@ -125,7 +131,7 @@ def fits_wider_models(problem: Problem) -> bool:
 
 
 def applicable(problem: Problem) -> dict[Hypothesis, list[Parameter]]:
-    """Return the explanations that a robot can have, with their parameters."""
+    """Return the hypotheses that a robot can have, with their parameters."""
     if not fits_wider_models(problem):
         return {}
     return {each: more for each in HYPOTHESES if (more := each.parameters(problem))}
@@ -138,7 +144,7 @@ def of_masses(problem: Problem) -> dict[Hypothesis, list[Parameter]]:
     return {each: each.parameters(problem) for each in other_masses(problem)}
 
 
-def try_explanations(
+def try_hypotheses(
     problem: Problem,
     refined: Refined,
     allows: Allows,
@@ -146,7 +152,7 @@ def try_explanations(
     known: Callable[[], Evidence] | None = None,
     say: Callable[[str], None] = lambda name: None,
 ) -> tuple[Tried, ...]:
-    """Screen all explanations of a fit's residual, and fit those that promise most.
+    """Screen all hypotheses on a fit's residual, and fit those that promise most.
 
     Each hypothesis says when it is worth a fit. Each body's mass is screened beside the laws. Where one
     leaves only noise, all are fitted: around a fit without it the ends of ranges may hide that another one
@@ -158,28 +164,49 @@ def try_explanations(
         allows: Which fits may be made.
         given: Earlier results; those of the same problem are kept.
         known: Returns the evidence on the fit, where somebody else needs it, too.
-        say: Called with the name of each explanation that is fitted.
+        say: Called with the name of each hypothesis that is fitted.
     """
     if any(one.of is problem for one in given):
         return tuple(one for one in given if one.of is problem)
-    can, masses = (
+    laws, masses = (
         {each: more for each, more in every.items() if each.worth_asking(refined.chi2)}
         for every in (applicable(problem), of_masses(problem))
     )
     if refined.chi2 > FAR_CHI2:
-        gains, enough = dict.fromkeys(can, 0.0), -np.inf
-    elif can or masses:
-        gains, enough = _gains(problem, refined, can | masses, known)
-    found = []
-    for each, more in [*can.items(), *sorted(masses.items(), key=lambda pair: -gains[pair[0]])]:
-        fitted = each.worth_a_fit(gains[each], enough) and allows(each.name, each.cost(problem, more))
-        if fitted:
-            say(each.name)
-        wide = fit_wider(problem, more) if fitted else None
-        found.append(Tried(each, problem, gains[each], wide))
-        if each in masses and wide is not None and wide.prediction.chi2 < MISMATCH_CHI2:
-            enough = -np.inf
+        screen = dict.fromkeys(laws, 0.0)
+        return tuple(_tried(problem, laws, screen, -np.inf, allows, say))
+    if not (laws or masses):
+        return ()
+    seen = evidence(problem, refined, answered=False) if known is None else known()
+    causes = [seen.gain([], group) for group in groups_of(seen.found)]
+    screen = _screened(problem, refined, laws | masses, seen)
+    least = _least(screen, causes)
+    found = _tried(problem, laws, screen, least, allows, say)
+    for each, more in sorted(masses.items(), key=lambda pair: -screen[pair[0]]):
+        (one,) = _tried(problem, {each: more}, screen, least, allows, say)
+        found.append(one)
+        if one.wider is not None and one.wider.prediction.chi2 < MISMATCH_CHI2:
+            least = -np.inf
     return tuple(found)
+
+
+def _tried(
+    problem: Problem,
+    can: Mapping[Hypothesis, Sequence[Parameter]],
+    screen: Mapping[Hypothesis, float],
+    least: float,
+    allows: Allows,
+    say: Callable[[str], None],
+) -> list[Tried]:
+    """Fit the hypotheses whose linearised effect gains ``least``."""
+    found = []
+    for each, more in can.items():
+        gain, wide = screen[each], None
+        if each.worth_a_fit(gain, least) and allows(each.name, each.cost(problem, more)):
+            say(each.name)
+            wide = fit_wider(problem, more)
+        found.append(Tried(each, problem, gain, wide))
+    return found
 
 
 def try_limits(problem: Problem, allows: Allows, say: Callable[[str], None]) -> tuple[Tried, ...]:
@@ -203,32 +230,30 @@ def try_limits(problem: Problem, allows: Allows, say: Callable[[str], None]) -> 
     return found
 
 
-def _gains(
-    problem: Problem,
-    refined: Refined,
-    can: Mapping[Hypothesis, Sequence[Parameter]],
-    known: Callable[[], Evidence] | None,
-) -> tuple[dict[Hypothesis, float], float]:
-    """Return the screened gain of each explanation, and that from which one is fitted."""
-    seen = evidence(problem, refined, answered=False) if known is None else known()
-    causes = [seen.gain([], group) for group in groups_of(seen.found)]
-    at = problem, refined.theta, refined.latency_s, refined.shooting, refined.point
-    gains = {
-        each: screened_gain(seen, screened(*at, each, more), one_sided(problem, more))
+def _screened(
+    problem: Problem, refined: Refined, can: Mapping[Hypothesis, Sequence[Parameter]], seen: Evidence
+) -> dict[Hypothesis, float]:
+    """Return what each hypothesis gains by its linearised effect; see :func:`screened_effect`."""
+    return {
+        each: screened_effect(seen, screened(problem, refined, each, more), one_sided(problem, more))[0]
         for each, more in can.items()
     }
-    return gains, max(needed(len(gains)), RIVAL * max(*causes, *gains.values()))
 
 
-def screened_gain(known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_]) -> float:
-    """Return the held-out deviance that an explanation gains by its linearised effect alone."""
-    return screened_effect(known, law, one_way)[0]
+def _least(screen: Mapping[Hypothesis, float], causes: Sequence[float] = ()) -> float:
+    """Return the linearised gain from which a hypothesis is fitted.
+
+    That of a first value says which one to fit, not whether it is there. So the best one is fitted even where
+    it gains little, unless one of the ``causes``, which gain so much, is far better.
+    """
+    best = max(screen.values())
+    return max(min(needed(len(screen)), best), RIVAL * max([best, *causes])) if best > 0 else np.inf
 
 
 def screened_effect(
     known: Evidence, law: Signature, one_way: npt.NDArray[np.bool_]
 ) -> tuple[float, FloatArray]:
-    """Return what an explanation gains by its linearised effect alone, and where the values go with it.
+    """Return what a hypothesis gains by its linearised effect alone, and where the values go with it.
 
     That is the held-out deviance, and the change of the own parameters, in their scales, and of the latency
     [s], (K + 1,). A dead zone below 0 explains what friction does, too, but no robot has one. Parameters that
@@ -254,33 +279,31 @@ def screened_effect(
 
 def screened(
     problem: Problem,
-    theta: FloatArray,
-    latency_s: float,
-    shooting: Shooting,
-    point: Point,
+    refined: Refined,
     found: Hypothesis,
     more: Sequence[Parameter],
+    values: Sequence[float] | None = None,
 ) -> Signature:
-    """Return what an explanation's parameters do to the predictions of a fit without it.
+    """Return what a hypothesis's parameters do to the predictions of a fit without it.
 
-    Each goes from no effect to its first value; those without an effect of their own stay.
+    Each goes from no effect to its value; those without an effect of their own stay.
 
     Args:
-        problem: The problem, without the explanation.
-        theta: Values of the fit, (K,).
-        latency_s: Its latency [s].
-        shooting: Its windows.
-        point: Its start states.
-        found: The explanation.
+        problem: The problem, without the hypothesis.
+        refined: Its fit.
+        found: The hypothesis.
         more: Its parameters.
+        values: Their values; their first ones by default.
     """
-    wide = problem.with_more(more)
-    sizes = sized(more)
-    K, off = len(theta), np.array([off_value(p) for p in more])
-    members = np.repeat(np.append(theta, off)[None], 1 + len(sizes), axis=0)
+    wide, shooting, point = problem.with_more(more), refined.shooting, refined.point
+    sizes, K = sized(more), len(refined.theta)
+    to = np.array([tried_value(p) for p in more] if values is None else values)
+    off = np.array([off_value(p) for p in more] if values is None else values)
+    off[sizes] = [off_value(more[k]) for k in sizes]
+    members = np.repeat(np.append(refined.theta, off)[None], 1 + len(sizes), axis=0)
     for row, k in enumerate(sizes):
-        members[1 + row, K + k] = tried_value(more[k])
-    late = np.full(len(members), latency_s)
+        members[1 + row, K + k] = to[k]
+    late = np.full(len(members), refined.latency_s)
     columns = []
     for e, data in enumerate(shooting.data):
         seen = wide.predict(members, late, data, point.position[e], point.velocity[e]).observed
@@ -293,11 +316,11 @@ def explained(problem: Problem, refined: Refined, tried: Sequence[Tried]) -> lis
 
     The fit without them, ``refined``, has used all recordings; each of them saw a part.
     """
-    named, gains = dict[str, tuple[Tried, WiderFit, list[int]]](), dict[str, HeldOut | None]()
+    named, gains = dict[str, tuple[Tried, WiderFit, list[int]]](), dict[str, UnseenGain | None]()
     for each in tried:
-        name, wide = each.explanation.name, each.wider
+        name, wide = each.hypothesis.name, each.wider
         gains[name] = gained = None if wide is None else held_out(wide, refined, len(tried))
-        if wide is not None and gained is not None and (order := _named(wide, each.explanation)):
+        if wide is not None and gained is not None and (order := _named(wide, each.hypothesis)):
             named[name] = each, wide, order
         else:
             gains[name] = None
@@ -309,12 +332,12 @@ def explained(problem: Problem, refined: Refined, tried: Sequence[Tried]) -> lis
 
 
 def rivals(found: Sequence[Explained]) -> list[Explained]:
-    """Return the best explanation, and those that predict about as well: no chance tells them apart."""
+    """Return the best hypothesis, and those that predict about as well: no chance tells them apart."""
     return [one for one in found if alike(found[0].diagnosis.deviance, one.diagnosis.deviance)]
 
 
 def likeliest(found: Sequence[Explained]) -> list[Explained]:
-    """Return the explanations without masses that predict worse than another body's, beyond chance.
+    """Return the hypotheses without masses that predict worse than another body's, beyond chance.
 
     Where one mass is wrong, the others gain, too.
     """
@@ -331,10 +354,10 @@ def keeps_mass(p: Parameter, value: float) -> bool:
 
 
 def _explained(
-    problem: Problem, refined: Refined, tried: Tried, wide: WiderFit, order: Sequence[int], gained: HeldOut
+    problem: Problem, refined: Refined, tried: Tried, wide: WiderFit, order: Sequence[int], gained: UnseenGain
 ) -> Explained:
     """Return an accepted hypothesis with these of its parameters."""
-    of = tried.explanation
+    of = tried.hypothesis
     named = [wide.more[k] for k in order]
     elements = tuple(dict.fromkeys(e for p in named for e in p.elements))
     if of is PLAY:

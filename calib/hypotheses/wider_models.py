@@ -15,7 +15,7 @@ from deal_hw.calib.data.parts import BEGIN_S, part_of, samples_in
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.fit.solver import correlated_samples
-from deal_hw.calib.hypotheses.judge import HeldOut
+from deal_hw.calib.hypotheses.judge import UnseenGain
 from deal_hw.calib.hypotheses.thresholds import WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.parameters import Parameter, ParameterSpace
@@ -112,7 +112,7 @@ def wider_cost(problem: Problem, fits: bool, more: int = 0) -> float:
     return 6.0 * members * periods * (2 if fits else 1) + 2.0 * predictions
 
 
-def held_out(wide: WiderFit, refined: Refined, asked: int = 1) -> HeldOut | None:
+def held_out(wide: WiderFit, refined: Refined, asked: int = 1) -> UnseenGain | None:
     """Return what a wider fit gains over the model as it is; None where no judge would accept that.
 
     The model as it is gets two chances, of which the better one counts.
@@ -126,13 +126,12 @@ def held_out(wide: WiderFit, refined: Refined, asked: int = 1) -> HeldOut | None
     seen, unseen = (
         problem.part([e.usable for e in part.shooting.problem.episodes]) for part in (fit, prediction)
     )
-    length = prediction.shooting.length
+    length, left = prediction.shooting.length, prediction.normal
+    # What it leaves counts once for each correlation time. What it explains is alike over many samples, too.
+    count = left.count / correlated_samples(left.residual, length)
 
-    def gained(theta: FloatArray, latency_s: float) -> HeldOut:
-        without = at_parameters(unseen, theta, latency_s, length)
-        # Neighbouring residuals of a wrong model are alike, and count once for each correlation time.
-        count = without.normal.count / correlated_samples(without.normal.residual, length)
-        return HeldOut(without.chi2, prediction.chi2, count)
+    def gained(theta: FloatArray, latency_s: float) -> UnseenGain:
+        return UnseenGain(at_parameters(unseen, theta, latency_s, length).chi2, prediction.chi2, count)
 
     try:
         found = gained(refined.theta, refined.latency_s)

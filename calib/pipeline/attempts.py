@@ -127,13 +127,13 @@ def with_limits(run: CalibrationRun, local: Refined) -> FitOutcome | Calibration
 def with_laws(run: CalibrationRun, local: Refined) -> FitOutcome | CalibrationRun:
     """Ask for laws that the model lacks, quantities that are 0 in it, and other masses.
 
-    Around a poor fit only play and what is 0 are fitted; see `try_explanations`.
+    Around a poor fit only play and what is 0 are fitted; see `try_hypotheses`.
     """
-    from deal_hw.calib.hypotheses.trials import try_explanations
+    from deal_hw.calib.hypotheses.trials import try_hypotheses
 
     if run.settings.diagnosis:
         with run.check(EXPLANATIONS):
-            tried = try_explanations(run.problem, with_rows(local), run.may_try, say=run.ask)
+            tried = try_hypotheses(run.problem, with_rows(local), run.may_try, say=run.ask)
         run = dataclasses.replace(run, tried=tried)
     return with_explanation(run) or run
 
@@ -147,7 +147,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
     from deal_hw.calib.hypotheses.trials import explained, rivals
     from deal_hw.calib.validation.checks import hold_alike
 
-    tried = [one for one in run.tried if run.takes(one.explanation)]
+    tried = [one for one in run.tried if run.takes(one.hypothesis)]
     if run.local is None or not tried:
         return None
     with run.check(EXPLANATIONS):
@@ -159,7 +159,7 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         return None
     exact: list[tuple[Explained, Refined, CalibrationRun]] = []
     for one in rivals([one for one in found if one.explains]):
-        name, wide = one.explanation.name, dataclasses.replace(run, problem=one.problem, progress=None)
+        name, wide = one.hypothesis.name, dataclasses.replace(run, problem=one.problem, progress=None)
         run.say("fit", f"{name} on all recordings")
         fit = refined_from(wide, one.theta, one.latency_s)
         if conclusive(one.problem, fit):
@@ -170,21 +170,21 @@ def with_explanation(run: CalibrationRun, searched: CalibrationResult | None = N
         return None
     # The model's own values are somebody's best guess, so of those that explain alike the nearest is taken.
     (best, fit, wide), *others = sorted(exact, key=lambda each: each[0].change)
-    names = [one.explanation.name for one, *_ in others]
-    alarm = dataclasses.replace(best.diagnosis, do=best.explanation.taken_as(best.added, names))
+    names = [one.hypothesis.name for one, *_ in others]
+    alarm = dataclasses.replace(best.diagnosis, do=best.hypothesis.taken_as(best.added, names))
     run.say(BEFORE_SEARCH, str(alarm))
-    rows = law_candidates(run.tried, found, best.explanation.name, names)
+    rows = law_candidates(run.tried, found, best.hypothesis.name, names)
     outcome = conclude_fit(dataclasses.replace(wide, progress=run.progress), searched, fit)
     if others:
         shifts = [best.shift_to(one) for one, *_ in others]
         known, added = hold_alike(best.problem, outcome.known, outcome.latency_s, shifts)
         outcome = dataclasses.replace(outcome, known=known).with_alarms(alike_std=added)
     return outcome.with_alarms(
-        *([] if best.explanation.certain else [alarm]),
+        *([] if best.hypothesis.certain else [alarm]),
         diagnosis=[
             one.diagnosis.to_json()
             for one in (best, *(one for one, *_ in others))
-            if not one.explanation.certain
+            if not one.hypothesis.certain
         ],
         candidates=[row.to_json() for row in ranked(rows)],
     )

@@ -200,9 +200,9 @@ class CalibrationRun:
         if self.progress is not None:
             self.progress(Progress(stage, done, total, message, **candidate))
 
-    def takes(self, explanation: Hypothesis) -> bool:
-        """Return whether the result may have an explanation: without laws, what an MJCF can say."""
-        return self.settings.laws or explanation.in_mjcf
+    def takes(self, hypothesis: Hypothesis) -> bool:
+        """Return whether the result may have a hypothesis: without laws, what an MJCF can say."""
+        return self.settings.laws or hypothesis.in_mjcf
 
     def ask(self, law: str) -> None:
         """Report that a law is tried."""

@@ -34,7 +34,7 @@ from deal_hw.calib.fit.output_error import (
 from deal_hw.calib.fit.solver import channel_scale, correlated_samples
 from deal_hw.calib.hypotheses.candidates import Candidate, Judged, Outcome, ranked
 from deal_hw.calib.hypotheses.hypothesis import Hypothesis, values_in_words
-from deal_hw.calib.hypotheses.judge import HeldOut, accepted
+from deal_hw.calib.hypotheses.judge import UnseenGain, accepted
 from deal_hw.calib.hypotheses.laws import LAG
 from deal_hw.calib.hypotheses.thresholds import MOST_LAWS, RIVAL
 from deal_hw.calib.hypotheses.trials import applicable
@@ -62,13 +62,13 @@ class LawCandidate:
     """A law that a robot may have, as candidate fits.
 
     Attributes:
-        explanation: The law.
+        hypothesis: The hypothesis.
         more: Its parameters.
         seconds: Windows of its fits [s]: those in which friction and drives show, then those that judge.
         start: Where its fits begin: a fit with it to a part of the recordings, (K + L,) and latency [s].
     """
 
-    explanation: Hypothesis
+    hypothesis: Hypothesis
     more: Sequence[Parameter]
     seconds: tuple[float, float]
     start: Member
@@ -77,7 +77,7 @@ class LawCandidate:
     def names(self) -> tuple[str, str]:
         """Names of its candidates, one for each window."""
         short, _ = self.seconds
-        return f"{short:g} s, {self.explanation.name}", f"long, {self.explanation.name}"
+        return f"{short:g} s, {self.hypothesis.name}", f"long, {self.hypothesis.name}"
 
     def widened(self, problem: Problem) -> Problem:
         """Return a problem with the law's parameters."""
@@ -97,7 +97,7 @@ class LawCandidate:
         found = self._values(theta)
         values = values_in_words(self.more, [found[p.name] for p in self.more])
         lower = percent(1 - float(np.exp(np.mean(np.log(choice.ratios)))))
-        law = self.explanation
+        law = self.hypothesis
         return Finding.alarm(
             f"With {law.name} ({values}) the error of predicted motions that were left out is {lower} lower.",
             law.means,
@@ -107,7 +107,7 @@ class LawCandidate:
     def facts(self, choice: LawfulChoice, theta: FloatArray) -> dict[str, Any]:
         """Return the law, its error in each fold over the best without it, and its values: plain JSON."""
         return {
-            "law": self.explanation.name,
+            "law": self.hypothesis.name,
             "error_ratio": choice.ratios,
             "values": self._values(theta),
             "window_s": choice.made.window_s,
@@ -129,7 +129,7 @@ class ScreenedLaws:
     """
 
     chosen: Sequence[LawCandidate] = ()
-    gains: Mapping[str, HeldOut] = field(default_factory=dict)
+    gains: Mapping[str, UnseenGain] = field(default_factory=dict)
     asked: int = 0
 
     def promising(self) -> list[str]:
@@ -177,12 +177,12 @@ class LawfulChoice:
 
     def candidates(self, laws: ScreenedLaws) -> list[Candidate]:
         """Return all laws that were fitted to a part of the recordings; those of the folds by these."""
-        rows, chosen = list[Candidate](), {law.explanation.name for law in laws.chosen}
+        rows, chosen = list[Candidate](), {law.hypothesis.name for law in laws.chosen}
         for name, gain in laws.gains.items():
             judged: Judged = "fit"
             share = gain.share
             outcome: Outcome = "not named" if name in chosen else "chance"
-            if self.law is not None and name == self.law.explanation.name:
+            if self.law is not None and name == self.law.hypothesis.name:
                 judged, outcome = "folds", "taken"
                 share = 1 - float(np.exp(2 * np.mean(np.log(self.ratios))))
             elif any(name in of for of in self.lost):
@@ -298,7 +298,7 @@ def explained_by_laws(run: CalibrationRun, searched: CalibrationResult, laws: La
         searched: Result of the search, or its substitute.
         laws: The laws; the fit begins where theirs ended.
     """
-    if laws.member is None or {law.explanation.name for law, _ in laws.choices} <= run.inexact:
+    if laws.member is None or {law.hypothesis.name for law, _ in laws.choices} <= run.inexact:
         return None
     fit = refined_from(run, *laws.member)
     if not conclusive(run.problem, fit):
@@ -341,7 +341,7 @@ def law_errors(
         for law in laws:
             if left.isdisjoint(law.names):
                 continue
-            say(fold, law.explanation.name)
+            say(fold, law.hypothesis.name)
             try:
                 members = law.members(train, fold=True)
                 values = errors(law.widened(test), list(members.values()))
@@ -377,7 +377,11 @@ def screened_laws(
         return ScreenedLaws()
     left_out, seen = fold_masks(problem, 2)
     part, rest = problem.part(seen), problem.part(left_out)
-    recipe, laws, gains = Recipe(seconds=seconds[0], iterations=SCREEN_ITERATIONS), [], dict[str, HeldOut]()
+    recipe, laws, gains = (
+        Recipe(seconds=seconds[0], iterations=SCREEN_ITERATIONS),
+        [],
+        dict[str, UnseenGain](),
+    )
     with run.check(EXPLANATIONS):
         try:
             without = fit_output_error(part, *fit, recipe).member
@@ -392,11 +396,11 @@ def screened_laws(
             rmse = prediction_rmse(rest.with_more(more), [member], seconds[0])[0]
             if not np.isfinite(rmse).all():
                 continue
-            gains[law.name] = HeldOut(1.0, float(np.mean((rmse / rms) ** 2)), count)
+            gains[law.name] = UnseenGain(1.0, float(np.mean((rmse / rms) ** 2)), count)
             laws.append(LawCandidate(law, more, seconds, member))
     found = ScreenedLaws((), gains, len(can))
     chosen = found.promising()
-    return dataclasses.replace(found, chosen=[law for law in laws if law.explanation.name in chosen])
+    return dataclasses.replace(found, chosen=[law for law in laws if law.hypothesis.name in chosen])
 
 
 def _with_law(

@@ -265,7 +265,7 @@ def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
 
     The local fit may be in another minimum, around which other laws gain.
     """
-    from deal_hw.calib.hypotheses.trials import applicable, of_masses, try_explanations
+    from deal_hw.calib.hypotheses.trials import applicable, of_masses, try_hypotheses
     from deal_hw.calib.validation.checks import unexplained
 
     takes = run.settings.laws or of_masses(run.problem) or any(e.in_mjcf for e in applicable(run.problem))
@@ -275,7 +275,7 @@ def with_laws_tried(run: CalibrationRun, refined: Refined) -> CalibrationRun:
         return run
     refined = with_rows(refined)
     with run.check(EXPLANATIONS):
-        tried = try_explanations(run.problem, refined, run.allows, say=run.ask)
+        tried = try_hypotheses(run.problem, refined, run.allows, say=run.ask)
     return dataclasses.replace(run, local=refined, tried=tried)
 
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from deal_hw.calib.hypotheses.judge import needed
 from deal_hw.calib.hypotheses.recording_zeros import next_zeros
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE
 from deal_hw.calib.report import charts
 from deal_hw.calib.report.gather import ReportInputs
 from deal_hw.calib.report.verdict import grouped, make_story, trust
@@ -143,8 +143,8 @@ def render(inputs: ReportInputs) -> str:
         strongest=[] if matrix is None else charts.strongest(matrix, result.space.names),
         strong=charts.STRONG,
         trace=charts.trace(result.trace),
-        candidates=candidate_rows(provenance.get("candidates") or ()),
-        evidence=EVIDENCE,
+        candidates=(candidates := candidate_rows(provenance.get("candidates") or ())),
+        needed=needed(len(candidates)) if candidates else 0.0,
         compared=compared_fits(_mapping(provenance.get("cross_validation"))),
         population=[]
         if result.population is None

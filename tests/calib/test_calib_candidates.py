@@ -12,7 +12,7 @@ from deal_hw.calib.data.folds import Choice
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.hypotheses.candidates import Candidate, effect_candidates, law_candidates, ranked
 from deal_hw.calib.hypotheses.diagnosis import name_causes
-from deal_hw.calib.hypotheses.judge import HeldOut
+from deal_hw.calib.hypotheses.judge import UnseenGain
 from deal_hw.calib.hypotheses.laws import HYPOTHESES
 from deal_hw.calib.hypotheses.laws import PLAY as PLAY_LAW
 from deal_hw.calib.hypotheses.thresholds import EVIDENCE
@@ -22,8 +22,8 @@ from deal_hw.calib.pipeline.law_choice import LawCandidate, LawfulChoice, Screen
 LOAD_LAW = next(law for law in HYPOTHESES if law.name == "friction that grows with load")
 
 
-def _gains(count: float, shares: Mapping[str, float]) -> dict[str, HeldOut]:
-    return {name: HeldOut(1.0, 1 - share, count) for name, share in shares.items()}
+def _gains(count: float, shares: Mapping[str, float]) -> dict[str, UnseenGain]:
+    return {name: UnseenGain(1.0, 1 - share, count) for name, share in shares.items()}
 
 
 def test_signatures_stand_by_what_each_gains_alone() -> None:

@@ -33,7 +33,7 @@ from deal_hw.calib.hypotheses.signatures import (
     signatures,
 )
 from deal_hw.calib.hypotheses.thresholds import EVIDENCE, NEAR_CHI2
-from deal_hw.calib.hypotheses.trials import Explained, Tried, explained, try_explanations
+from deal_hw.calib.hypotheses.trials import Explained, Tried, explained, try_hypotheses
 from deal_hw.calib.hypotheses.wider_models import fit_wider, zero_parameters
 from deal_hw.calib.validation.checks import biased, unexplained, with_causes, with_unsure
 from deal_hw.calib.validation.residual_place import (
@@ -427,7 +427,7 @@ def test_a_right_model_has_no_cause() -> None:
     """Neither a signature, nor a delay, nor play predicts left-out windows better."""
     _, problem, fit = truth("pendulum", None)
     assert name_causes(evidence(problem, fit)) == []
-    assert explained(problem, fit, try_explanations(problem, fit, all_allowed)) == []
+    assert explained(problem, fit, try_hypotheses(problem, fit, all_allowed)) == []
 
 
 @pytest.mark.slow
@@ -521,10 +521,10 @@ def test_an_armature_that_is_0_in_the_model_is_named_with_its_value(tmp_path: Pa
     fit = with_rows(refine(problem, problem.space.nominal, robot.delay_s, (0.2,), iterations=8))
     assert "pivot.armature" not in problem.space.names and unexplained(fit)
     assert [p.name for p in zero_parameters(problem)] == ["pivot.armature"]
-    tried = try_explanations(problem, fit, all_allowed)
+    tried = try_hypotheses(problem, fit, all_allowed)
     best = explained(problem, fit, tried)[0]
     found = best.diagnosis
-    assert best.explanation.name == "a rotor's inertia that is 0 in the model" and best.explains
+    assert best.hypothesis.name == "a rotor's inertia that is 0 in the model" and best.explains
     value = float(re.findall(r"pivot.armature = (\S+) kg", found.seen)[0])
     assert value == pytest.approx(0.01, rel=0.1)
     assert found.code == "inertia" and found.subject == ("pivot",) and found.share > 0.5

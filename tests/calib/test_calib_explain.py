@@ -23,7 +23,7 @@ from deal_hw.calib.hypotheses.hypothesis import off_value, one_sided, tried_valu
 from deal_hw.calib.hypotheses.laws import HYPOTHESES
 from deal_hw.calib.hypotheses.laws import PLAY as PLAY_LAW
 from deal_hw.calib.hypotheses.thresholds import DECISIVE, FAR_CHI2
-from deal_hw.calib.hypotheses.trials import applicable, explained, try_explanations
+from deal_hw.calib.hypotheses.trials import applicable, explained, try_hypotheses
 from deal_hw.calib.pipeline.attempts import with_explanation
 from deal_hw.calib.pipeline.conclusion import without_search
 from deal_hw.calib.pipeline.law_choice import (
@@ -70,7 +70,7 @@ def test_another_minimum_is_no_play() -> None:
     _, problem, fit = truth("pendulum", None)
     elsewhere = with_rows(at_parameters(problem, 1.5 * fit.theta, fit.latency_s + 0.008, fit.shooting.length))
     assert elsewhere.chi2 > 10 * fit.chi2
-    assert explained(problem, elsewhere, try_explanations(problem, elsewhere, all_allowed)) == []
+    assert explained(problem, elsewhere, try_hypotheses(problem, elsewhere, all_allowed)) == []
 
 
 @pytest.mark.slow
@@ -80,13 +80,13 @@ def test_play_is_found_and_measured() -> None:
     The fit with play is the expensive part: one of this problem is taken, that of another is not.
     """
     _, problem, fit = truth("pendulum", "backlash")
-    tried = try_explanations(problem, fit, all_allowed)
-    assert tried[0].explanation is PLAY_LAW and tried[0].wider is not None
-    assert try_explanations(problem, fit, refused, tried) == tried
-    (again, *_) = try_explanations(dataclasses.replace(problem), fit, refused, tried)
-    assert again.explanation is PLAY_LAW and again.wider is None
+    tried = try_hypotheses(problem, fit, all_allowed)
+    assert tried[0].hypothesis is PLAY_LAW and tried[0].wider is not None
+    assert try_hypotheses(problem, fit, refused, tried) == tried
+    (again, *_) = try_hypotheses(dataclasses.replace(problem), fit, refused, tried)
+    assert again.hypothesis is PLAY_LAW and again.wider is None
     found = explained(problem, fit, tried)[0]
-    assert found.explanation is PLAY_LAW and found.explains
+    assert found.hypothesis is PLAY_LAW and found.explains
     cause = found.diagnosis
     assert cause.code == "backlash" and cause.subject == ("pivot",)
     assert "0.06 rad at pivot" in cause.seen and "servo_play" in cause.do
@@ -127,9 +127,9 @@ def test_friction_at_rest_is_found_as_a_law() -> None:
     Neither play nor a lag nor load does, so none of them is named.
     """
     robot, problem, fit = truth("pendulum", "friction")
-    tried = try_explanations(problem, fit, all_allowed)
+    tried = try_hypotheses(problem, fit, all_allowed)
     found = explained(problem, fit, tried)
-    assert [one.explanation.name for one in found] == ["friction that falls with speed"]
+    assert [one.hypothesis.name for one in found] == ["friction that falls with speed"]
     best = found[0]
     assert best.added == ("pivot.friction_stribeck", "pivot.stribeck_speed")
     assert best.chi2 < 0.5 * best.before and best.diagnosis.code == "friction"
@@ -161,8 +161,8 @@ def test_an_effect_of_a_drive_or_an_encoder_is_found_and_measured(
     local = local_fit(problem, lambda *_, **__: None)
     assert local is not None
     fit = with_rows(local)
-    found = explained(problem, fit, try_explanations(problem, fit, all_allowed))[0]
-    assert found.explanation.name in LAWS[fault] and found.chi2 < 0.5 * found.before
+    found = explained(problem, fit, try_hypotheses(problem, fit, all_allowed))[0]
+    assert found.hypothesis.name in LAWS[fault] and found.chi2 < 0.5 * found.before
     assert found.theta[len(problem.space) :] == pytest.approx([value], rel=0.1)
 
 
@@ -170,10 +170,10 @@ def test_an_effect_of_a_drive_or_an_encoder_is_found_and_measured(
 def test_friction_by_the_motors_torque_is_no_dead_zone() -> None:
     """0.2 of the torque; a dead zone below 0 would explain it to first order, but none is tried."""
     _, problem, fit = truth("pendulum", "load-friction")
-    tried = try_explanations(problem, fit, all_allowed)
-    assert {one.explanation.name: one.screened for one in tried}["servos with a dead zone"] == 0.0
+    tried = try_hypotheses(problem, fit, all_allowed)
+    assert {one.hypothesis.name: one.screened for one in tried}["servos with a dead zone"] == 0.0
     (found,) = explained(problem, fit, tried)
-    assert found.explanation.name == "friction that grows with the motor's torque"
+    assert found.hypothesis.name == "friction that grows with the motor's torque"
     assert found.theta[-1] == pytest.approx(LOAD_FRICTION, rel=0.1) and found.chi2 < 0.8 * found.before
 
 
@@ -224,7 +224,7 @@ def test_a_value_of_0_is_not_told_beside_others() -> None:
 def test_a_heavier_link_is_no_law_of_friction() -> None:
     """The mass explains more than a load would: the law is not even fitted."""
     _, problem, fit = truth("double-pendulum", "mass")
-    tried = {one.explanation.name: one for one in try_explanations(problem, fit, all_allowed)}
+    tried = {one.hypothesis.name: one for one in try_hypotheses(problem, fit, all_allowed)}
     load = tried["friction that grows with load"]
     assert load.wider is None
 
@@ -353,7 +353,7 @@ def test_without_laws_a_law_is_only_named() -> None:
         problem,
         settings=Validation(laws=False),
         local=with_rows(fit),
-        tried=try_explanations(problem, with_rows(fit), all_allowed),
+        tried=try_hypotheses(problem, with_rows(fit), all_allowed),
     )
     assert with_explanation(run) is None
     taken = with_explanation(dataclasses.replace(run, settings=Validation()))

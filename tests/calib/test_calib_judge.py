@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deal_hw.calib.hypotheses.judge import HeldOut, accepted, needed
+from deal_hw.calib.hypotheses.judge import UnseenGain, accepted, needed
 from deal_hw.calib.hypotheses.thresholds import FALSE_DISCOVERIES
 
 ASKED, SAMPLES = 20, 400
 
 
-def gains(rng: np.random.Generator, true: int) -> dict[int, HeldOut]:
+def gains(rng: np.random.Generator, true: int) -> dict[int, UnseenGain]:
     """Return what each of 20 regressors gains on 400 samples beside a constant, of which ``true`` act.
 
     Each is fitted to half of the samples and predicts the other half; neighbours have 0.7 of the same effect,
@@ -23,12 +23,12 @@ def gains(rng: np.random.Generator, true: int) -> dict[int, HeldOut]:
     half = SAMPLES // 2
     # The model without a hypothesis has seen all samples.
     before = float(np.mean((values[half:] - values.mean()) ** 2))
-    found = dict[int, HeldOut]()
+    found = dict[int, UnseenGain]()
     for k in range(ASKED):
         design = np.stack([np.ones(SAMPLES), columns[:, k]], axis=1)
         slope, *_ = np.linalg.lstsq(design[:half], values[:half], rcond=None)
         after = float(np.mean((values[half:] - design[half:] @ slope) ** 2))
-        found[k] = HeldOut(before, after, half)
+        found[k] = UnseenGain(before, after, half)
     return found
 
 
@@ -54,13 +54,13 @@ def test_more_evidence_is_needed_the_more_is_asked() -> None:
     assert np.exp(needed(20) / 4) == pytest.approx(200)
     assert np.exp(needed(20, 2) / 4) == pytest.approx(100)
     # One of 20 needs a deviance of 21.2, and two of them 18.4.
-    two = {name: HeldOut(1.1, 1.1 * np.exp(-d / 100), 100) for name, d in (("a", 19.0), ("b", 20.0))}
+    two = {name: UnseenGain(1.1, 1.1 * np.exp(-d / 100), 100) for name, d in (("a", 19.0), ("b", 20.0))}
     assert accepted(two, 20) == ["b", "a"] and accepted({"b": two["b"]}, 20) == []
     assert accepted({"b": two["b"], "c": None}) == ["b"]
 
 
 def test_what_explains_little_is_not_accepted() -> None:
     """2 % of the squared residual, however sure; and a worse prediction is a share below 0."""
-    assert accepted({"a": HeldOut(1.0, 0.98, 1e6)}) == []
-    worse = HeldOut(1.0, 1.2, 1e3)
+    assert accepted({"a": UnseenGain(1.0, 0.98, 1e6)}) == []
+    worse = UnseenGain(1.0, 1.2, 1e3)
     assert worse.share < 0 and worse.deviance < 0 and not worse.promises(1)

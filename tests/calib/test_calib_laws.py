@@ -249,9 +249,9 @@ def test_friction_by_load_is_chosen_where_dry_friction_has_taken_its_place(tmp_p
     fit = fit_output_error(problem, problem.space.nominal, 0.0, Recipe(seconds=0.4))
     found = screened_laws(small_run(problem), problem, [fit.member], (0.4, 2.0))
     (law,) = found.chosen
-    assert law.explanation.name == "friction that grows with load"
+    assert law.hypothesis.name == "friction that grows with load"
     shares = {name: gain.share for name, gain in found.gains.items()}
-    of_load = shares.pop(law.explanation.name)
+    of_load = shares.pop(law.hypothesis.name)
     assert of_load > 0.3 and shares.pop("friction that grows with the motor's torque") < 0.5 * of_load
     assert max(shares.values()) < 1 / 7
     assert law.start[0][-1] == pytest.approx(0.3, rel=0.5)

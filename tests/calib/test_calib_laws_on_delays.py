@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +16,11 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, at_parameters
+from deal_hw.calib.hypotheses import trials
 from deal_hw.calib.hypotheses.cause_words import Diagnosis
-from deal_hw.calib.hypotheses.hypothesis import sized, tried_value
+from deal_hw.calib.hypotheses.hypothesis import Hypothesis, sized, tried_value
+from deal_hw.calib.hypotheses.judge import needed
+from deal_hw.calib.hypotheses.laws import PLAY
 from deal_hw.calib.hypotheses.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.hypotheses.signatures import Signature
 from deal_hw.calib.hypotheses.trials import applicable
@@ -57,18 +61,20 @@ def test_friction_by_speed_and_jitter_are_found_together(seed: int, before: floa
     assert any("the fit leaves a chi2 of" in str(alarm) for alarm in result.alarms)
 
 
-def _law(problem: Problem) -> list[Parameter]:
-    return next(more for each, more in applicable(problem).items() if each.name == FALLING)
+def _law(problem: Problem) -> tuple[Hypothesis, list[Parameter]]:
+    return next((each, more) for each, more in applicable(problem).items() if each.name == FALLING)
 
 
 def test_only_joints_that_show_a_law_get_it(noisy_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each with what shapes it; the first of all where none is seen beyond chance."""
-    more = _law(noisy_problem)
+    _, more = _law(noisy_problem)
     assert len(sized(more)) == 2 and len(more) == 4
     effect = Signature("friction", FALLING, (np.arange(2.0) * np.ones((3, 4, 1)),))
     alone = {0.0: 30.0, 1.0: 5.0}
     monkeypatch.setattr(
-        laws_on_delays, "screened_gain", lambda seen, own, way: alone[float(own.columns[0][0, 0, 0])]
+        laws_on_delays,
+        "screened_effect",
+        lambda seen, own, way: (alone[float(own.columns[0][0, 0, 0])], None),
     )
     seen: object = None
     found = laws_on_delays._seen_alone(seen, effect, noisy_problem, more)  # type: ignore[arg-type]
@@ -82,16 +88,19 @@ def test_only_joints_that_show_a_law_get_it(noisy_problem: Problem, monkeypatch:
 
 
 @pytest.mark.parametrize(
-    ("gain", "after", "bare", "laws"),
+    ("gain", "judged", "after", "bare", "laws"),
     [
-        (-1.0, 0.9, 1.0, []),
-        (1.0, 0.9, 1.0, [FALLING]),
-        (25.0, 0.999, 1.0, []),
-        (1.0, 0.9, 0.9, []),
+        (-1.0, 40.0, 0.9, 1.0, []),
+        (1.0, 40.0, 0.9, 1.0, [FALLING]),
+        (1.0, 5.0, 0.9, 1.0, []),
+        (25.0, 40.0, 0.999, 1.0, []),
+        (1.0, 40.0, 0.9, 0.9, []),
     ],
+    ids=["no effect", "is there", "does not predict", "no better fit", "another minimum"],
 )
-def test_a_fit_decides_whether_a_law_is_there(
+def test_a_fit_and_what_it_predicts_decide_whether_a_law_is_there(
     gain: float,
+    judged: float,
     after: float,
     bare: float,
     laws: list[str],
@@ -99,15 +108,25 @@ def test_a_fit_decides_whether_a_law_is_there(
     noisy_refined: Refined,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its linearised effect only says which law to fit, and a fit without it may find the same minimum."""
-    law = next(each for each in applicable(noisy_problem) if each.name == FALLING)
-    more, shift = _law(noisy_problem), np.full(len(noisy_refined.theta) + 1, 0.1)
+    """The effect of a first value only says which law to fit; that of the found one has to predict."""
+    (law, more), shift = _law(noisy_problem), np.full(len(noisy_refined.theta) + 1, 0.1)
     wide = noisy_problem.with_more(more)
     theta = np.append(noisy_refined.theta, [tried_value(p) for p in more])
     fit = at_parameters(wide, theta, noisy_refined.latency_s, noisy_refined.shooting.length)
     fit = dataclasses.replace(fit, chi2=after * noisy_refined.chi2)
     monkeypatch.setattr(laws_on_delays, "applicable", lambda of: {law: more} if of is noisy_problem else {})
-    monkeypatch.setattr(laws_on_delays, "screened_effect", lambda *_: (gain, shift))
+    of_values: list[object] = []
+
+    def screened(*_: object) -> Signature:
+        of_values.append(_[4] if len(_) > 4 else None)
+        return Signature("friction", FALLING, ())
+
+    monkeypatch.setattr(laws_on_delays, "screened", screened)
+    monkeypatch.setattr(
+        laws_on_delays, "screened_effect", lambda *_: (gain if of_values[-1] is None else judged, shift)
+    )
+    seen = SimpleNamespace(count=500.0)
+    monkeypatch.setattr(laws_on_delays, "evidence", lambda *_, **__: seen)
     monkeypatch.setattr(laws_on_delays, "_seen_alone", lambda *_: more)
     monkeypatch.setattr(laws_on_delays, "_fitted", lambda *_: WiderFit(noisy_problem, more, fit, fit))
     lower = dataclasses.replace(noisy_refined, chi2=bare * noisy_refined.chi2)
@@ -117,8 +136,32 @@ def test_a_fit_decides_whether_a_law_is_there(
     assert list(found.laws) == laws
     # A weight of exp(gain / 2) beside 1 for no law; one beyond chance that a fit has refused weighs nothing.
     weight = np.exp(gain / 2) / (1 + np.exp(gain / 2))
-    expected = np.zeros(0) if laws or gain > 20 else np.sqrt(weight) * shift
+    expected = np.zeros(0) if laws or gain > needed(1) else np.sqrt(weight) * shift
     np.testing.assert_allclose(found.unsure, expected)
+
+
+def test_the_effect_of_found_values_keeps_their_shape(noisy_problem: Problem, noisy_refined: Refined) -> None:
+    """Friction at rest is judged with the speed at which it falls; without any it has no effect."""
+    law, more = _law(noisy_problem)
+    values = np.array([p.nominal for p in more])
+    (first,) = trials.screened(noisy_problem, noisy_refined, law, more).columns
+    (same,) = trials.screened(noisy_problem, noisy_refined, law, more, list(values)).columns
+    np.testing.assert_allclose(same, first)
+    faster = np.where([k in sized(more) for k in range(len(more))], values, 2 * values)
+    (other,) = trials.screened(noisy_problem, noisy_refined, law, more, list(faster)).columns
+    assert np.abs(other - first).max() > 0.1 * np.abs(first).max() > 0
+    none = np.where([k in sized(more) for k in range(len(more))], 0.0, values)
+    assert not np.any(trials.screened(noisy_problem, noisy_refined, law, more, list(none)).columns[0])
+
+
+def test_the_hypothesis_that_promises_most_is_fitted() -> None:
+    """However little its effect gains by a first value, unless a cause gains twice as much."""
+    best, second, no = (dataclasses.replace(PLAY, name=name) for name in ("a", "b", "c"))
+    screen = {best: 3.0, second: 2.9, no: 0.0}
+    assert [law.name for law, gain in screen.items() if gain >= trials._least(screen)] == ["a"]
+    assert trials._least(screen, [6.1]) > 3.0 and trials._least({no: 0.0}) == np.inf
+    strong = {best: 300.0, second: 160.0, no: 140.0}
+    assert [law.name for law, gain in strong.items() if gain >= trials._least(strong)] == ["a", "b"]
 
 
 def test_laws_that_may_be_there_widen_intervals(noisy_problem: Problem, noisy_refined: Refined) -> None:
@@ -138,7 +181,7 @@ def test_laws_that_may_be_there_widen_intervals(noisy_problem: Problem, noisy_re
 
 def test_intervals_hold_shorter_windows_beside_a_law(noisy_problem: Problem, noisy_refined: Refined) -> None:
     """Fits without the law say nothing of its parameters, and widen the others."""
-    more = _law(noisy_problem)[:1]
+    more = _law(noisy_problem)[1][:1]
     wide = noisy_problem.with_more(more)
     theta = np.append(noisy_refined.theta, more[0].nominal)
     length = noisy_refined.shooting.length

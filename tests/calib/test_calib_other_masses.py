@@ -27,7 +27,7 @@ from deal_hw.calib.hypotheses.trials import (
     likeliest,
     of_masses,
     rivals,
-    try_explanations,
+    try_hypotheses,
 )
 from deal_hw.calib.pipeline.attempts import with_explanation
 from deal_hw.calib.validation.checks import hold_alike
@@ -64,10 +64,10 @@ def test_a_body_that_keeps_nothing_has_no_other_mass() -> None:
 def test_around_a_poor_fit_no_mass_is_fitted() -> None:
     """Its effect there says nothing, and near the noise the same masses are screened."""
     _, problem, fit = truth("double-pendulum", None)
-    poor = try_explanations(problem, dataclasses.replace(fit, chi2=FAR_CHI2 + 1), refused)
-    near = try_explanations(problem, fit, refused)
-    assert not {UPPER, FORE} & {one.explanation.name for one in poor}
-    assert {UPPER, FORE} <= {one.explanation.name for one in near}
+    poor = try_hypotheses(problem, dataclasses.replace(fit, chi2=FAR_CHI2 + 1), refused)
+    near = try_hypotheses(problem, fit, refused)
+    assert not {UPPER, FORE} & {one.hypothesis.name for one in poor}
+    assert {UPPER, FORE} <= {one.hypothesis.name for one in near}
 
 
 def _explained(problem: Problem, body: str, deviance: float, own: float, mass: float) -> Explained:
@@ -100,7 +100,7 @@ def test_the_other_body_is_where_the_values_go_if_it_is_true(tmp_path: Path) -> 
     poor = dataclasses.replace(upper, diagnosis=dataclasses.replace(upper.diagnosis, deviance=70.0))
 
     def bodies(found: list[Explained]) -> list[str]:
-        return [one.explanation.name for one in found]
+        return [one.hypothesis.name for one in found]
 
     assert bodies(rivals([fore, upper])) == bodies(likeliest([fore, upper])) == [FORE, UPPER]
     assert bodies(likeliest([fore, poor])) == [FORE]
@@ -135,9 +135,9 @@ def test_a_wrong_mass_becomes_a_parameter_and_the_other_body_is_named() -> None:
     local = local_fit(problem)
     assert local is not None
     fit = with_rows(local)
-    tried = try_explanations(problem, fit, all_allowed)
+    tried = try_hypotheses(problem, fit, all_allowed)
     found = explained(problem, fit, tried)
-    assert {one.explanation.name for one in rivals(found)} == {UPPER, FORE}
+    assert {one.hypothesis.name for one in rivals(found)} == {UPPER, FORE}
     assert "in the model 0." in found[0].diagnosis.seen and found[0].explains
     # An MJCF can say it, so those who want no laws get it, too.
     outcome = with_explanation(small_run(problem, settings=Validation(laws=False), local=fit, tried=tried))

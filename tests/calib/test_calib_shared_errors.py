@@ -18,6 +18,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import at_parameters, local_fit, refine
 from deal_hw.calib.hypotheses import shared_errors as shared_errors_module
+from deal_hw.calib.hypotheses.judge import UnseenGain
 from deal_hw.calib.hypotheses.random_delay import DelayFit, DelaysAsked, RandomDelay
 from deal_hw.calib.hypotheses.shared_errors import (
     ChannelChange,
@@ -138,7 +139,7 @@ def test_a_correction_that_leaves_more_than_noise_is_no_cause(
     before: float, after: float, decides: bool
 ) -> None:
     """A poor fit that becomes less poor names nothing: a real cart got a wrong factor of a half that way."""
-    assert shared_errors_module._decides(before, after, 4000) is decides
+    assert shared_errors_module._decides(UnseenGain(before, after, 4000), 17) is decides
 
 
 def test_a_slide_is_in_millimetres_and_no_pair_of_a_hinge(tmp_path: Path) -> None:
