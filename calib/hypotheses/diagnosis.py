@@ -34,8 +34,12 @@ from deal_hw.calib.hypotheses.recording_zeros import MOST_ZERO, named_zeros
 from deal_hw.calib.hypotheses.signatures import Cause, Signature, masses
 from deal_hw.calib.hypotheses.thresholds import (
     BURST_LEFT,
+    BURST_PART,
+    BURST_SHARE,
+    BURST_SIZE,
     DECISIVE,
     EVIDENCE,
+    MASS_ALIKE,
     MOST_CAUSES,
     NEAR_CHI2,
     NOTICED,
@@ -53,18 +57,6 @@ from deal_hw.calib.hypotheses.wider_models import fit_wider, held_out, wider_cos
 from deal_hw.calibration import listed, percent
 from deal_hw.findings import Finding
 from deal_hw.types import FloatArray
-
-ALIKE = 0.8
-"""Least explained share of a named body's mass, relative to the best one's [-]."""
-
-BURST_PART = 0.05
-"""Bursts occupy at most this part of the time [-]."""
-
-BURST_SHARE = 0.4
-"""Bursts hold at least this share of the squared residual [-]."""
-
-BURST_SIZE = 40.0
-"""Least squared residual of a burst over the median [-]."""
 
 MASS = "another mass"
 """Name of a check."""
@@ -264,7 +256,7 @@ def _mass_diagnosis(known: Evidence, taken: Sequence[Signature], share: float, d
 
     def alike(cause: Cause) -> list[Signature]:
         gains = [(known.gain(taken, [s]), s) for s in known.found if s.cause == cause]
-        enough = [(gain, s) for gain, s in gains if gain >= ALIKE * deviance]
+        enough = [(gain, s) for gain, s in gains if gain >= MASS_ALIKE * deviance]
         return [s for _, s in sorted(enough, key=lambda pair: -pair[0])]
 
     bodies = [s for s in alike("mass") if _possible(known, taken, [s])]

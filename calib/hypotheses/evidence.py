@@ -28,7 +28,7 @@ from deal_hw.calib.hypotheses.signatures import (
     by_recording,
     signatures,
 )
-from deal_hw.calib.hypotheses.thresholds import EVIDENCE
+from deal_hw.calib.hypotheses.thresholds import EVIDENCE, OWN_EFFECT
 from deal_hw.sim.recordings.own_setups import recordings_of
 from deal_hw.types import FloatArray
 
@@ -40,11 +40,6 @@ ROUNDS = 2
 
 PARAMETER_PRIOR = 0.5
 """Spread of parameters in the regression, as a share of their range [-]."""
-
-OWN = 0.02
-"""A signature of which the parameters explain all but this share is their own effect. On 12 cart-poles the
-searched inertia of the pole left 0.1 to 0.8 % on nine, 1.8 to 7 % on three; friction, loads and play left 1
-to 96 %, and a servo whose damping acts late 0.6 to 28 %."""
 
 LATENCY_PRIOR_S = 0.02
 """Spread of the latency in the regression [s]."""
@@ -138,7 +133,7 @@ class Evidence:
         across = np.sum([np.tensordot(x, c, axes=((0, 1), (0, 1))) for x, c in pairs], axis=0)
         own = np.sum([np.sum(c**2, axis=(0, 1)) for _, c in pairs], axis=0)
         left = own - np.sum(across * np.linalg.solve(self._information, across), axis=0)
-        keep = left > OWN * own
+        keep = left > OWN_EFFECT * own
         if keep.all():
             return signature
         columns = tuple(c[..., keep] for c in signature.columns)

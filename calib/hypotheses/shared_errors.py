@@ -24,7 +24,7 @@ from deal_hw.calib.fit.intervals import MISMATCH_CHI2, NEGLIGIBLE_CHI2
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
 from deal_hw.calib.hypotheses.candidates import Candidate
 from deal_hw.calib.hypotheses.judge import UnseenGain, needed
-from deal_hw.calib.hypotheses.thresholds import NOTICED_CORRECTION, WINDOW_S
+from deal_hw.calib.hypotheses.thresholds import CORRECTIONS_ALIKE, NOTICED_CORRECTION, WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.sim.engine.model import at_step
@@ -61,10 +61,6 @@ error its correction had at most 0.74 times their residual after two steps."""
 BEHIND = 1.5
 """Ratio of its mean squared residual to theirs above which it is far behind [-]: twice the largest above.
 Wrong corrections of a real Go2 had 2.3 to 2.9, and took another ten steps each."""
-
-ALIKE = 1.1
-"""Largest ratio of the held-out squared residual to the best one's for candidates that are named together
-[-]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -345,7 +341,7 @@ def find_shared_error(
     gained = UnseenGain(as_recorded, found[best], count)
     if not _decides(gained, len(ranked)):
         return check
-    alike = sorted((e for e in found if found[e] <= ALIKE * found[best]), key=lambda e: found[e])
+    alike = sorted((e for e in found if found[e] <= CORRECTIONS_ALIKE * found[best]), key=lambda e: found[e])
     error_found = FoundError(tuple(alike), found[best], as_recorded, gained.deviance, test, length)
     return dataclasses.replace(check, found=error_found)
 

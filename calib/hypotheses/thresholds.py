@@ -1,4 +1,6 @@
-"""What decides between hypotheses: each threshold once, with its source.
+"""What decides between hypotheses: each threshold once, with its source or reason.
+
+Where neither stands, the number is a choice that nobody has measured.
 
 What decides whether there is anything to explain belongs to the fit
 (:data:`~deal_hw.calib.fit.intervals.MISMATCH_CHI2` and its neighbours).
@@ -46,8 +48,16 @@ times the noise. Local fits of three real robots have 75 to 160. On two of them 
 than around fits of predictions, and on the SO-101 it is the latter's that predicts held-out motion better."""
 
 RIVAL: Final = 0.5
-"""Least gain in deviance of a hypothesis that is fitted, over that of the best one [-]. A linearised effect,
-or half of the recordings, is about that uncertain."""
+"""Least gain in deviance of a hypothesis that is fitted, over that of the best one [-]."""
+
+BURST_PART: Final = 0.05
+"""Bursts occupy at most this part of the time [-]."""
+
+BURST_SHARE: Final = 0.4
+"""Bursts hold at least this share of the squared residual [-]."""
+
+BURST_SIZE: Final = 40.0
+"""Least squared residual of a burst over the median [-]."""
 
 BURST_LEFT: Final = 4.0
 """Chi2 that bursts may leave: twice the noise. Bursts predict nothing, and are chosen for their size, so only
@@ -56,6 +66,24 @@ what they leave can support them."""
 SURE: Final = 5.0
 """Least value of a parameter that a named hypothesis has, in its standard deviations [-]. Each joint has one,
 and the standard deviations are those of a part of the recordings, without kinks."""
+
+LEAST_PLAY: Final = 0.2
+"""Least play of a named joint, as a share of the widest one [-]."""
+
+LEAST_RISE: Final = 0.01
+"""Least distance of a found mass from the lower end of its range, as a share [-]."""
+
+MASS_ALIKE: Final = 0.8
+"""Least explained share of a named body's mass, relative to the best one's [-]."""
+
+CORRECTIONS_ALIKE: Final = 1.1
+"""Largest ratio of the held-out squared residual to the best one's for corrections of the recordings that are
+named together [-]."""
+
+OWN_EFFECT: Final = 0.02
+"""A signature of which the parameters explain all but this share is their own effect. On 12 cart-poles the
+searched inertia of the pole left 0.1 to 0.8 % on nine, 1.8 to 7 % on three; friction, loads and play left 1
+to 96 %, and a servo whose damping acts late 0.6 to 28 %."""
 
 WINDOW_S: Final = 0.2
 """Windows of fits that hypotheses are judged by [s]: the shortest of a refinement, as even a poor start does
@@ -68,4 +96,8 @@ MOST_ALARMS: Final = 2
 """Most causes of a residual that become alarms; all are in the provenance."""
 
 MOST_LAWS: Final = 3
-"""Most laws that a fit takes, one on top of the other. A fourth has not been seen on a robot."""
+"""Most laws that a fit takes, one on top of the other."""
+
+MOST_FOLDED: Final = 2
+"""Most laws that are fitted in the folds. A law is often about as good as another one: play and friction that
+falls with speed both delay a joint that turns round."""

@@ -30,7 +30,7 @@ from deal_hw.calib.hypotheses.hypothesis import (
 from deal_hw.calib.hypotheses.judge import UnseenGain, accepted, alike, needed
 from deal_hw.calib.hypotheses.laws import HYPOTHESES, LIMITS, PLAY, ZERO_CAUSES, other_masses
 from deal_hw.calib.hypotheses.signatures import Signature, whitened_changes
-from deal_hw.calib.hypotheses.thresholds import DECISIVE, FAR_CHI2, RIVAL, SURE
+from deal_hw.calib.hypotheses.thresholds import DECISIVE, FAR_CHI2, LEAST_PLAY, LEAST_RISE, RIVAL, SURE
 from deal_hw.calib.hypotheses.wider_models import WiderFit, fit_wider, held_out
 from deal_hw.calibration import listed
 from deal_hw.findings import Finding
@@ -39,12 +39,6 @@ from deal_hw.types import FloatArray
 
 Allows = Callable[[str, float], bool]
 """Whether a check, by name, may run that takes at most so many physics steps."""
-
-LEAST_PLAY = 0.2
-"""Least play of a named joint, as a share of the widest one [-]."""
-
-LEAST_RISE = 0.01
-"""Least distance of a found mass from the lower end of its range, as a share [-]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +276,7 @@ def screened(
     refined: Refined,
     found: Hypothesis,
     more: Sequence[Parameter],
-    values: Sequence[float] | None = None,
+    values: Sequence[float] | FloatArray | None = None,
 ) -> Signature:
     """Return what a hypothesis's parameters do to the predictions of a fit without it.
 

@@ -36,7 +36,7 @@ from deal_hw.calib.hypotheses.candidates import Candidate, Judged, Outcome, rank
 from deal_hw.calib.hypotheses.hypothesis import Hypothesis, values_in_words
 from deal_hw.calib.hypotheses.judge import UnseenGain, accepted
 from deal_hw.calib.hypotheses.laws import LAG
-from deal_hw.calib.hypotheses.thresholds import MOST_LAWS, RIVAL
+from deal_hw.calib.hypotheses.thresholds import MOST_FOLDED, MOST_LAWS, RIVAL
 from deal_hw.calib.hypotheses.trials import applicable
 from deal_hw.calib.pipeline.calibration_run import EXPLANATIONS, CalibrationRun, FitOutcome
 from deal_hw.calib.pipeline.conclusion import conclude_fit
@@ -46,10 +46,6 @@ from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
 from deal_hw.parameters import Parameter
 from deal_hw.types import FloatArray
-
-MOST_FOLDED = 2
-"""Most laws that are fitted in the folds. A law is often about as good as another one: play and friction that
-falls with speed both delay a joint that turns round."""
 
 SCREEN_ITERATIONS, FOLD_ITERATIONS, ITERATIONS = 2, 3, 6
 """Most derivatives of each fit with a law, to a part of the recordings, in a fold and to all of them. The
