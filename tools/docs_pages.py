@@ -58,6 +58,49 @@ API_NAMES = {
 }
 """Pages of the API with names of ``deal_hw`` itself."""
 
+ENGINE_NAMES = {
+    "Calibration problem": (
+        "Problem",
+        "WindowData",
+        "MemberPrediction",
+        "longest_windows",
+        "part_of",
+        "samples_in",
+        "Kind",
+        "default_space",
+        "with_doubts",
+        "HeldOut",
+        "HeldoutErrors",
+    ),
+    "Residuals and solvers": (
+        "Shooting",
+        "Point",
+        "Normal",
+        "OwnResidual",
+        "Following",
+        "LeastSquares",
+        "SolverSettings",
+        "minimise",
+        "value_bounds",
+        "null_space",
+        "NullSpace",
+    ),
+    "Fits and intervals": (
+        "refine",
+        "Refined",
+        "refined_at",
+        "at_parameters",
+        "fit_output_error",
+        "OutputErrorFit",
+        "Recipe",
+        "uncertainty_at",
+        "uncertainty",
+        "Uncertainty",
+        "with_rows",
+    ),
+}
+"""Pages of the API with names of ``deal_hw.calib.api``, without the contracts."""
+
 API_MODULES = {
     "Types, errors, clock": ("types", "errors", "clock"),
     "Robot contracts": ("robot", "transport", "description"),
@@ -202,8 +245,9 @@ def api_place(title: str) -> str:
 def api_pages() -> dict[str, str]:
     """Return the reference of the Python API, for mkdocstrings: a start page, and a page a subject."""
     import deal_hw
+    from deal_hw.calib import api
 
-    full = {name.rpartition(".")[2]: name for name in public_names(deal_hw)}
+    full = {name.rpartition(".")[2]: name for name in (*public_names(api), *public_names(deal_hw))}
     found = {"reference/api.md": api_start(full)}
     for title, names in API_NAMES.items():
         lines = [f"# {title}", "", "[All pages of the API](api.md)", ""]
@@ -219,6 +263,11 @@ def api_pages() -> dict[str, str]:
                 of_robots = f"{heading} for {', '.join(robots)}" if robots else heading
                 lines += reference(f"{one.__module__}.{one.__qualname__}", of_robots, inherited=True)
         found[api_place(title)] = "\n".join(lines)
+    for title, names in ENGINE_NAMES.items():
+        lines = [f"# {title}", "", "[All pages of the API](api.md)", ""]
+        for name in names:
+            lines += reference(full[name], f"deal_hw.calib.api.{name}")
+        found[api_place(title)] = "\n".join(lines)
     for title, modules in API_MODULES.items():
         lines = [f"# {title}", "", "[All pages of the API](api.md)", ""]
         for module in modules:
@@ -231,19 +280,22 @@ def api_start(full: Mapping[str, str]) -> str:
     """Return the start page of the API: what is on which page.
 
     Args:
-        full: The full name of each public name of ``deal_hw``.
+        full: The full name of each public name of ``deal_hw`` and ``deal_hw.calib.api``.
     """
     lines = [
         "# Python API",
         "",
-        "[From Python](../how-to/python.md) shows how to use it. These pages are made from the docstrings.",
+        "[From Python](../how-to/python.md) shows how to use it, and [Your own residual, parameter or "
+        "solver](../how-to/own-calibration-engine.md) the engine's pieces. These pages are made from the "
+        "docstrings.",
         "",
         "| page | has |",
         "|---|---|",
     ]
-    for title, names in API_NAMES.items():
+    tables = ("deal_hw", API_NAMES), ("deal_hw.calib.api", ENGINE_NAMES)
+    for package, title, names in ((of, *row) for of, table in tables for row in table.items()):
         place = Path(api_place(title)).name
-        links = ", ".join(f"[`deal_hw.{name}`]({place}#{full[name]})" for name in names)
+        links = ", ".join(f"[`{package}.{name}`]({place}#{full[name]})" for name in names)
         lines.append(f"| [{title}]({place}) | {links} |")
     for title, modules in API_MODULES.items():
         place = Path(api_place(title)).name

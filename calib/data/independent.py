@@ -32,9 +32,7 @@ def in_order(
         yield from (function(problem, spec) for spec in specs)
         return
     found: dict[int, tuple[R, int]] = {}
-    work = problem.tasks.once(
-        (function, problem), lambda: partial(_counted, function, problem.on_one_thread())
-    )
+    work = problem.tasks.once((function, problem), lambda: partial(_counted, function, for_worker(problem)))
     # Closed at once, which cancels what is left, and not when the memory is collected.
     with contextlib.closing(problem.tasks.completed(work, specs)) as completed:
         for index in range(len(specs)):
@@ -44,6 +42,11 @@ def in_order(
             result, steps = found.pop(index)
             problem.count(steps)
             yield result
+
+
+def for_worker(problem: Problem) -> Problem:
+    """Return the problem on one thread, and without the policy, which cannot be sent."""
+    return problem.sharing(threads=1, policy=None)
 
 
 def _counted(function: Callable[[Problem, S], R], problem: Problem, spec: S) -> tuple[R, int]:

@@ -337,10 +337,6 @@ class Problem:
         """Count physics steps that were simulated in another process."""
         self._batches.counted.steps += steps
 
-    def on_one_thread(self) -> Problem:
-        """Return the problem for a worker: on one thread, and without the policy, which cannot be sent."""
-        return self.sharing(threads=1, policy=None)
-
     def part(self, chosen: Sequence[Mask]) -> Problem:
         """Return the problem with only the samples under one mask per recording, (T,), usable."""
         masked = zip(self.episodes, chosen, strict=True)
@@ -379,10 +375,6 @@ class Problem:
             return other
         theta = np.append(self.command_delays.theta, [p.nominal for p in parameters])
         return other.sharing(command_delays=dataclasses.replace(self.command_delays, theta=theta))
-
-    def with_robot(self, robot: RobotModel) -> Problem:
-        """Return the problem with another model of the same robot; the rest is shared."""
-        return self.sharing(robot=robot)
 
     @property
     def first_latency_s(self) -> float:

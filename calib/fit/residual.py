@@ -219,16 +219,16 @@ class Shooting:
         C = problem.coordinates
         # Where a window diverges whatever its start, nothing else is left to say where it starts.
         self.start_information = [np.maximum(1 / d.prior_std**2, LEAST_INFORMATION) for d in self.data]
-        self._parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
+        self.parameter_step = NOISE_FREE_PARAMETER_STEP if problem.noise_free else PARAMETER_STEP
         self._state_step = np.concatenate([np.full(C, POSITION_STEP), np.full(C, VELOCITY_STEP)])
         kinds = {p.kind for p in problem.space.parameters}
         if SERVO_PUNCH in kinds:
-            self._parameter_step = JUMP_PARAMETER_STEP
+            self.parameter_step = JUMP_PARAMETER_STEP
             self._state_step = np.repeat([JUMP_POSITION_STEP, JUMP_VELOCITY_STEP], C)
         if SERVO_RESOLUTION in kinds:
-            self._parameter_step = COUNTED_PARAMETER_STEP
+            self.parameter_step = COUNTED_PARAMETER_STEP
         if self.contacts:
-            self._parameter_step = CONTACT_PARAMETER_STEP
+            self.parameter_step = CONTACT_PARAMETER_STEP
             self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
 
     @property
@@ -320,7 +320,7 @@ class Shooting:
         K, C = len(point.value) - 1, self.problem.coordinates
         moved = 0 if self.given else C
         members = K + 1 + 2 * moved
-        steps = np.concatenate([np.full(K, self._parameter_step), [LATENCY_STEP_S], self._state_step])
+        steps = np.concatenate([np.full(K, self.parameter_step), [LATENCY_STEP_S], self._state_step])
         steps = stretch * steps[:members]
         # A negative latency or friction is no model: there, differences are taken inwards.
         low, high = value_bounds(self.problem)

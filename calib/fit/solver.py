@@ -213,7 +213,7 @@ def solve(
     # Beside a kink, steps shrink to nothing. A new trust region around the updated start states continues, or
     # shows that this is the end.
     while True:
-        fit = _Following(shooting, point, normal, notify)
+        fit = Following(shooting, point, normal, notify)
         value, more = minimise(fit, point.value, bounds, settings, fixed_latency=shooting.fixed_latency)
         point, normal = converged(shooting, fit.at(value), 1, fit.normal_at(value))
         point, normal = restarted(shooting, point, normal)
@@ -232,7 +232,7 @@ def solve_parameters(shooting: Shooting, point: Point, settings: SolverSettings)
     Return the solution and the number of derivatives. There are none at the solution: they cost as many
     simulations as a step.
     """
-    fit = _Following(shooting, point, None, None)
+    fit = Following(shooting, point)
     bounds = value_bounds(shooting.problem)
     value, used = minimise(fit, point.value, bounds, settings, fixed_latency=shooting.fixed_latency)
     return fit.at(value), used
@@ -303,8 +303,8 @@ def out_of_line(shooting: Shooting, point: Point) -> list[Mask]:
     return [c > size * scipy.stats.chi2.isf(chance, f) for c, f in zip(costs, freedom, strict=True)]
 
 
-class _Following:
-    """The residual as a function of the parameters alone; start states follow.
+class Following:
+    """The residual as a function of the parameters alone, for any solver; start states follow.
 
     It starts at a point and, if known, the normal equations there with their rows. ``notify`` gets the later
     ones.
@@ -314,8 +314,8 @@ class _Following:
         self,
         shooting: Shooting,
         point: Point,
-        normal: Normal | None,
-        notify: Callable[[Point, Normal], None] | None,
+        normal: Normal | None = None,
+        notify: Callable[[Point, Normal], None] | None = None,
     ) -> None:
         self._shooting, self._here, self._normal = shooting, point, normal
         self._last, self._notify = point, notify

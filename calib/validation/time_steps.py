@@ -266,7 +266,7 @@ def step_alarm(known: Uncertainty, found: StepCheck) -> tuple[Finding, ...]:
 
 def halved(problem: Problem) -> Problem:
     """Return the problem with half the physics step; recordings, noise and smoothed states are shared."""
-    return problem.with_robot(at_step(problem.robot, problem.robot.step_s / 2.0))
+    return problem.sharing(robot=at_step(problem.robot, problem.robot.step_s / 2.0))
 
 
 def _shifted(rows: WindowRows, change: FloatArray) -> WindowRows:

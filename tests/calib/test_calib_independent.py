@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deal_hw.calib.data.independent import in_order
+from deal_hw.calib.data.independent import for_worker, in_order
 from deal_hw.calib.data.innovations import Members, predict_population
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Restarts, run_identity
@@ -82,7 +82,7 @@ def test_results_and_steps_are_the_same(both: tuple[Problem, Problem]) -> None:
 
 def test_a_policy_stays_here(both: tuple[Problem, Problem]) -> None:
     """Its network cannot be sent, and these fits do not run it; other numbers of the problem stay."""
-    sent = pickle.loads(pickle.dumps(both[1].on_one_thread()))
+    sent = pickle.loads(pickle.dumps(for_worker(both[1])))
     assert sent.policy is None and sent.threads == 1 and sent.steps == 0
     assert np.array_equal(sent.noise_std, both[1].noise_std) and both[1].policy is not None
 

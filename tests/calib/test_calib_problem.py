@@ -30,7 +30,7 @@ def test_a_shared_problem_estimates_nothing_again_and_counts_along(
     kinds = {
         "latency": problem.sharing(fixed_latency_s=0.01),
         "space": problem.with_space(narrow),
-        "robot": problem.with_robot(problem.robot),
+        "robot": problem.sharing(robot=problem.robot),
         "part": problem.part([np.arange(len(e.sample)) > 20 for e in problem.episodes]),
     }
     data, theta = problem.windows(8)[0], problem.space.nominal[None]

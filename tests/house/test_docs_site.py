@@ -15,6 +15,7 @@ from syntax import walk
 
 import deal_hw
 from deal_hw import documentation
+from deal_hw.calib import api as calib_api
 from deal_hw.cli.verbs import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -196,6 +197,18 @@ def test_each_public_name_is_on_one_page_of_the_api(pages: dict[str, str]) -> No
     for name in names:
         assert f"#{name})" in start
     assert max(text.count("::: ") for text in api.values()) <= 12
+
+
+def test_the_pages_have_each_piece_of_the_calibration_engine(pages: dict[str, str]) -> None:
+    """What `deal_hw.calib.api` names is on a page: classes and functions one by one, contracts by module."""
+    text = "\n".join(text for place, text in pages.items() if place.startswith("reference/api"))
+    contracts = {"Parameter", "ParameterSpace"}
+    aliases = {"Member", "Residual"}
+    described = {name for names in docs_pages.ENGINE_NAMES.values() for name in names}
+    assert described | contracts | aliases == set(calib_api.__all__)
+    for name in described:
+        assert f"heading: deal_hw.calib.api.{name}\n" in text
+    assert "::: deal_hw.parameters\n" in text
 
 
 def test_names_in_docstrings_are_names() -> None:

@@ -76,6 +76,7 @@ ROOMS = {
         {"validation"},
         {"design"},
         {"pipeline", "report"},
+        {"api"},
     ),
     "drivers": (
         {"command_echo", "servo_bus", "topic_robot", "transports"},
