@@ -257,7 +257,7 @@ def uncertainty(
     inflation = kinks**2 * max(1.0, chi2) * tau
     slope, known = normal.gradient, normal.prior
     data = normal.hessian - np.diag(known)
-    # The range is a flat prior; its variance keeps directions without information as wide as the range.
+    # The range is a flat prior, of variance w^2 / 12: directions without information stay as wide as it.
     flat = np.append(space.width**2, (latency_range_s[1] - latency_range_s[0]) ** 2) / 12.0
     belief = known + 1.0 / flat
     # Null directions scale by the range themselves, so only what was measured counts here.
@@ -273,6 +273,7 @@ def uncertainty(
     # Directions without information stay as wide as the range, however autocorrelated residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
     factor = np.maximum(factor, 1.0)
+    # D V D, with the factors in the diagonal D: correlations stay.
     covariance = covariance * np.outer(factor, factor)
     for k in map(int, np.flatnonzero(bound)):
         covariance[k, k] = _bound_std(precision, free, k, slope[k] / inflation, flat) ** 2
@@ -463,6 +464,8 @@ def contradictions(space: ParameterSpace, theta: FloatArray, std: FloatArray) ->
         std: Its standard deviations in the parameters' own scales, (K,).
     """
     mean, expected = space.prior
+    # (x - m) / (s_m^2 + s^2)^(1/2). An estimate that knows the prior varies around it by (s_m^2 - s^2)^(1/2)
+    # only, so this is cautious.
     far = (space.to_scale(theta) - space.to_scale(mean)) / np.hypot(expected, std)
     names = [
         f"{space.names[k]} = {theta[k]:.3g} {space.free[k].unit}, expected {mean[k]:.3g}: "

@@ -3,6 +3,15 @@
 Any rotation of the directions without information is equally valid. Those with the fewest parameters tell a
 user what to do ("measure one of them"). Pairs of single parameters often hide what is confounded: a delay
 goes with the armatures of all joints together. So whole kinds are compared.
+
+Symbols, for K parameters in their own scale:
+    A: information of the data, half the Hessian of the cost, (K, K).
+    R: diagonal; of the range's standard deviations, w_k / 12^(1/2), or of those of the priors, (K,).
+    l_i, v_i: eigenvalues [-] and eigenvectors, (K,), of R A R.
+
+Sources: what is not asked is eliminated by a Schur complement, Boyd and Vandenberghe, Convex Optimization
+(2004), appendix A.5.5; variances inflated by other parameters, Belsley, Kuh and Welsch, Regression
+Diagnostics (1980), chapter 3.
 """
 
 from __future__ import annotations
@@ -68,7 +77,8 @@ def null_space(space: ParameterSpace, hessian: FloatArray) -> NullSpace:
     root = space.width / np.sqrt(12.0)
     values, vectors = np.linalg.eigh(hessian * np.outer(root, root))
     blind = values < max(LEAST_INFORMATION, ROUNDING * float(values[-1]))
-    # Posterior variance along each of them, the range's own variance being the prior's.
+    # Along v_i the posterior variance is 1 / (1 + l_i) of the range's: informations add. So these directions
+    # alone leave parameter k the variance R_kk^2 sum_i v_ik^2 / (1 + l_i).
     spread = vectors[:, blind] ** 2 @ (1.0 / (1.0 + np.maximum(values[blind], 0.0)))
     directions = sparse_basis(vectors[:, blind].T) * root
     if len(directions):
@@ -154,11 +164,12 @@ def expected_directions(space: ParameterSpace, data: FloatArray, covariance: Flo
     known, free = np.flatnonzero(np.isfinite(std)), np.flatnonzero(~np.isfinite(std))
     if not known.size:
         return ()
-    # What the parameters without a prior follow says nothing of the others. Their range keeps it invertible.
+    # What the parameters without a prior, f, follow says nothing of the others, k. Their range keeps it
+    # invertible: A_k|f = A_kk - A_fk^T (A_ff + 12 / w_f^2)^-1 A_fk.
     inner = data[np.ix_(free, free)] + np.diag(12.0 / space.width[free] ** 2)
     cross = data[np.ix_(free, known)]
     left = data[np.ix_(known, known)] - cross.T @ np.linalg.solve(inner, cross)
-    # In units of the priors: an eigenvalue below 1 is a direction in which the data say less.
+    # Eigenvalues of R A_k|f R, with the priors' R: below 1 the data say less of a direction than its prior.
     values, vectors = np.linalg.eigh(left * np.outer(std[known], std[known]))
     combined: dict[str, None] = {}
     alone: list[str] = []
@@ -188,6 +199,8 @@ def _common_scale(space: ParameterSpace, moved: FloatArray, covariance: FloatArr
     together = np.flatnonzero((share > ALIKE) & space.log_scale)
     if len(together) < FEWEST_OF_A_SCALE or np.any(np.abs(np.delete(share, together)) > NAMED_PART):
         return None
+    # For y = ln of the n parameters, with covariance C: the scale is their mean, of variance 1^T C 1 / n^2,
+    # and the ratios are y less that mean, (1 - 1 1^T / n) y. A half width z s of ln is the share e^(z s) - 1.
     ratios = np.eye(len(together)) - 1 / len(together)
     of_them = covariance[np.ix_(together, together)]
     spread = np.diag(ratios @ of_them @ ratios)
@@ -266,6 +279,7 @@ def confounded(problem: Problem, information: FloatArray) -> tuple[Confounded, .
     for a, b in itertools.combinations(names, 2):
         without = [i for name, members in kinds.items() if name != b for i in members]
         alone = _free_std(precision, without)
+        # sigma_i / sigma_i|b, the root of the variance inflation by kind b.
         factor = float(np.median([whole[i] / alone[i] for i in kinds[a]]))
         if factor >= NARROWER:
             found.append(Confounded(a, b, factor))

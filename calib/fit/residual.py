@@ -427,6 +427,7 @@ class Shooting:
 
     def vector(self, point: Point) -> FloatArray:
         """Return all whitened residuals at a point, priors last, (M,)."""
+        # Its squared length is f: r_w, then L_w^(1/2) (s_w - m_w) of each window, then P^(1/2) (p - q).
         found = []
         for e, residual in enumerate(self.residuals(point)):
             flat = residual.reshape(len(residual), -1)
@@ -458,6 +459,7 @@ class Shooting:
 
     def cost(self, point: Point) -> float:
         """Return the sum of all squared whitened residuals at a point; infinite where it diverged."""
+        # f(p, s), see the module's text.
         prior = ((point.value - self.prior_mean)[None] ** 2 @ self.prior_information)[0]
         return float(prior + np.sum([c.sum() for c in self.window_costs(point)]))
 
@@ -523,6 +525,7 @@ class Shooting:
         together[number, entries] = steps[chosen]
         x = point.position[e] + together[:, None, P : P + C]
         v = point.velocity[e] + together[:, None, P + C :]
+        # y(p + h_i e_i) - y(p) of each entry i; entries of one simulation move different coordinates.
         predicted = self._predict(point.value + together[:, :P], self.data[e], x, v).observed
         found = predicted[number] - self._observed(point)[e]
         return np.asarray(np.where(reach[:, self._moved_with][:, None, None], found, 0.0))

@@ -382,6 +382,7 @@ def cauchy_windows(data: Sequence[WindowData], residuals: Sequence[FloatArray]) 
 def kurtosis(residuals: Sequence[FloatArray]) -> float:
     """Return the fourth moment over the squared second; 3 for noise. A 0 is a missing sample."""
     values = np.concatenate([r.ravel() for r in residuals])
+    # n sum r^4 / (sum r^2)^2
     count = np.count_nonzero(values)
     return float(count * np.sum(values**4) / max(float(np.sum(values**2)) ** 2, 1e-300))
 
@@ -396,6 +397,7 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
         [np.sum(np.where(s, r, 0.0) ** 2, axis=(0, 1)) for r, s in zip(errors, seen, strict=True)], axis=0
     )
     counts = np.sum([np.sum(s, axis=(0, 1)) for s in seen], axis=0)
+    # s_j = (sum e_j^2 / n_j)^(1/2), at most 1.4826 median |e_j| (Huber, Robust Statistics, 1981, chapter 5).
     scale = np.sqrt(squares / np.maximum(counts, 1))
     if robust:
         size = np.concatenate([np.abs(r).reshape(-1, r.shape[-1]) for r in errors])
@@ -408,5 +410,6 @@ def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
 
     Residuals are whitened, (W, H, M) per episode, and 0 for missing samples; lags end at ``longest`` samples.
     """
+    # tau = 1 + 2 sum_k rho_k (Madras and Sokal 1988), up to the first rho_k <= 0.
     positive = itertools.takewhile(lambda found: found[0] > 0, autocorrelations(residuals, longest))
     return sum((2 * correlation for correlation, _ in positive), 1.0)

@@ -4,6 +4,12 @@ The common scale of all masses, frictions and gains moves nothing, but each of t
 derivative along such a direction is a sum of columns that cancel. Dry friction makes kinks, so each column
 is off by a percent or so, and what is left of the sum looks like information: on an arm driven by torques it
 held a scale to 5 % that nothing holds. So predictions are compared a step along the direction to either side.
+
+Symbols: J, derivatives of whitened residuals r by parameters and latency p, (M, K + 1); U, diagonal, standard
+deviations expected of them; d = U e, a direction, e in units of U; H - P = J^T J, the data's information.
+
+Source of the update: Broyden (1965), the smallest change of J that has the wanted product with one direction,
+here in the norm of J U.
 """
 
 from __future__ import annotations
@@ -43,6 +49,7 @@ def with_weak_directions(shooting: Shooting, point: Point, normal: Normal) -> No
     """
     unit = _expected_std(shooting)
     normal = _along_each(shooting, point, normal, [scale_direction(shooting) / np.maximum(unit, 1e-300)])
+    # Eigenvectors e of U (H - P) U: the data's information against what was expected.
     values, vectors = np.linalg.eigh((normal.hessian - np.diag(normal.prior)) * np.outer(unit, unit))
     weak = vectors[:, values < WEAK_INFORMATION].T[:MOST_DIRECTIONS]
     return _along_each(shooting, point, normal, weak)
@@ -65,7 +72,8 @@ def _along_each(shooting: Shooting, point: Point, normal: Normal, directions: It
         by = _along(shooting, point, step * moves)
         if by is None:
             continue
-        # J' = J + (c - J d) w^T, with the derivative c along d, and w d = 1: all across it keep theirs.
+        # J' = J + (c - J d) w^T, with the derivative c along d, and w = U^-1 e / |e|^2, so that w^T d = 1:
+        # all that is across it in units of U keeps its derivative.
         dual = np.divide(each, unit, out=np.zeros_like(unit), where=unit > 0) / float(each @ each)
         rows = tuple(
             dataclasses.replace(
@@ -74,6 +82,7 @@ def _along_each(shooting: Shooting, point: Point, normal: Normal, directions: It
             for r, c in zip(normal.rows, by, strict=True)
         )
         found = of_rows(shooting, point, normal, rows)
+        # d^T H d, the information along d, of which errors of a derivative make more.
         if moves @ found.hessian @ moves < moves @ normal.hessian @ moves:
             normal = found
     return normal
@@ -103,6 +112,7 @@ def _along(shooting: Shooting, point: Point, step: FloatArray) -> list[FloatArra
     first, last = moved[0], moved[1] if len(sides) == 2 else shooting.residuals(point)
     found = []
     for up, down in zip(first, last, strict=True):
+        # (r(p + h d) - r(p - h d)) / 2, or one side of it where a range ends: (r(p +- h d) - r(p)) / +-1.
         change = (up - down) / (len(sides) * sides[0])
         found.append(np.nan_to_num(change.reshape(len(change), -1), nan=0.0, posinf=0.0, neginf=0.0))
     return found

@@ -91,6 +91,7 @@ class EnsembleKalman(Stateful):
         """
         residual = self._replace_diverged(residual)
         N, M = residual.shape
+        # |d_n|^2 / 2, minus the logarithm of the likelihood up to a constant.
         misfit = 0.5 * np.sum(residual**2, axis=1)
         # G = left diag(scale) right: columns of `left` span members, rows of `right` span observations. A
         # prediction is a constant minus the residual, hence the sign.
@@ -121,6 +122,7 @@ class EnsembleKalman(Stateful):
         """Scale deviations so that no coordinate's spread is below ``spread``; the tempering restarts."""
         mean = self._members.mean(axis=0)
         std = np.maximum(self._members.std(axis=0, ddof=1), 1e-12)
+        # z_n = mean + max(spread / std, 1) (z_n - mean), coordinate by coordinate.
         self._members = mean + (self._members - mean) * np.maximum(spread / std, 1.0)
         self.tempering = 0.0
 
@@ -216,12 +218,14 @@ class KalmanStepper(LogitStepper):
 
 def logit(unit: FloatArray, edge: float = 1e-9) -> FloatArray:
     """Map the unit interval, without its edges, to the real line, where steps need no bounds."""
+    # z = ln(u / (1 - u))
     inside = np.clip(unit, edge, 1 - edge)
     return np.asarray(np.log(inside) - np.log1p(-inside))
 
 
 def logistic(z: FloatArray) -> FloatArray:
     """Return the inverse of :func:`logit`."""
+    # 1 / (1 + e^-z) = (1 + tanh(z / 2)) / 2, which does not overflow.
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * z)))
 
 
