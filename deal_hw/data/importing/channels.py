@@ -8,13 +8,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from deal_hw.data.files import sha256_of
 from deal_hw.errors import DatasetError, short
-from deal_hw.reading import NAMES
 from deal_hw.types import FloatArray
 
 _PICK = re.compile(r"(?P<array>.+)\[(?P<inside>[^\[\]]+)\]")
@@ -26,7 +24,7 @@ class Channels:
 
     Attributes:
         path: The file or folder.
-        kind: "csv", "npz", "mcap", "lerobot" or "deal-hw".
+        kind: Of file, such as "csv", "npz", "mcap", "lerobot" or "deal-hw".
         digest: SHA-256 of the read bytes.
         arrays: By name, (T,) or (T, K); those of one clock have one length.
         labels: Names of the K columns of an array, if the file has them.
@@ -58,6 +56,11 @@ class Channels:
     def is_wide(self, name: str) -> bool:
         """Return whether there is an array of this name with several columns."""
         return name in self.arrays and self.arrays[name].ndim == 2
+
+    def width(self, name: str) -> int:
+        """Return the number of columns of an array; 1 for a channel without any."""
+        values = self.arrays[name]
+        return 1 if values.ndim == 1 else values.shape[1]
 
     def column(self, name: str) -> FloatArray:
         """Return one channel, (T,).
@@ -124,18 +127,6 @@ def digest_of_files(paths: Sequence[Path]) -> str:
     if len(paths) == 1:
         return digest_of_file(paths[0])
     return hashlib.sha256("".join(map(digest_of_file, paths)).encode()).hexdigest()
-
-
-def unwanted(dtype: np.dtype[Any], shape: tuple[int, ...]) -> str:
-    """Return why an array of a file is no channel and no list of names; "" if it is one."""
-    what = f"{short(dtype, 40)} {short(shape, 40)}"
-    if dtype.kind in "US":
-        return "" if len(shape) == 1 and shape[0] <= NAMES else what
-    if dtype.kind == "f" and len(shape) > 2:
-        return f"{what} is a batch; save each recording by itself, (T, K), such as ARRAY[0]"
-    if dtype.kind not in "fiub" or len(shape) not in (1, 2) or (len(shape) == 2 and min(shape) > NAMES):
-        return what
-    return ""
 
 
 def as_floats(values: object) -> FloatArray:

@@ -291,7 +291,7 @@ def _by_joint(
             (time is not None and guess.channel == time.column)
             or not guess.role
             or not guess.stem
-            or channels.is_wide(guess.channel)
+            or channels.width(guess.channel) > 1
         ):
             continue
         key = _key(" ".join(guess.stem))
@@ -368,6 +368,14 @@ def _guess_time(channels: Channels, names: Iterable[str], prefixes: tuple[str, .
     stamped = [name for name in stamps if name.lower().endswith((".header.stamp", ".log_time"))]
     if stamped:
         return TimeColumn(column=stamped[0])
+    inside = [
+        _time_column(channels, name, unit)
+        for name in stamps
+        for base, unit in _readings_of_time(name.lower().rpartition(".")[2])
+        if base in _TIME_NAMES and "." in name and not name.startswith("/")
+    ]
+    if len(inside) == 1:
+        return inside[0]
     # A single channel in a unit of time needs no name.
     timed = {name: given[0].lower() for name in stamps if (given := channels.units.get(name, ()))}
     timed = {name: _TIME_UNITS[unit] for name, unit in timed.items() if unit in _TIME_UNITS}

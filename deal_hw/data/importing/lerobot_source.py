@@ -17,15 +17,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from deal_hw.data.files import sha256_of
-from deal_hw.data.importing.channels import Channels, as_floats
-from deal_hw.errors import DatasetError, MissingExtraError, short
-from deal_hw.reading import NUMBERS, RECORDING_BYTES, check_size, read_json, reading
+from deal_hw.data.importing.channels import Channels
+from deal_hw.data.importing.parquet_source import columns_of
+from deal_hw.errors import DatasetError, short
+from deal_hw.reading import NUMBERS, read_json, reading
 from deal_hw.schema import OPEN, refusal
 from deal_hw.types import FloatArray
 
 FLOAT32_STAMP_S = 1e-4
 """Stamps closer than this to frame_index / fps are its float32 rounding [s]."""
-_BATCH_ROWS = 65_536
 _DEEPEST = 8
 _DROPPED = ("index", "task_index", "episode_index", "frame_index")
 
@@ -110,32 +110,18 @@ def _info(path: Path) -> _Info:
 
 def _read_file(file: Path, features: Mapping[str, Any], most: int) -> list[tuple[int, dict[str, FloatArray]]]:
     """Return number and channels of each episode in a Parquet file."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise MissingExtraError("pyarrow", "lerobot") from error
+
+    def wanted(schema: Any) -> list[str]:
+        known = set(schema.names)
+        names = [
+            name
+            for name, feature in features.items()
+            if name in known and str(feature.get("dtype", "")).startswith(("float", "int", "bool"))
+        ]
+        return names + [name for name in ("episode_index", "frame_index") if name in known - set(names)]
+
     with reading(file, "data of a LeRobot dataset"):
-        check_size(file, RECORDING_BYTES)
-        with pq.ParquetFile(file) as opened:
-            known = opened.schema_arrow.names
-            wanted = [
-                name
-                for name, feature in features.items()
-                if name in known and str(feature.get("dtype", "")).startswith(("float", "int", "bool"))
-            ]
-            own = ("episode_index", "frame_index")
-            wanted += [name for name in own if name in known and name not in wanted]
-            _check_extent(opened.metadata, len(wanted), most)
-            batches, count = [], 0
-            for batch in opened.iter_batches(batch_size=_BATCH_ROWS, columns=wanted):
-                # Lists may have any length, which is known only now.
-                count += batch.nbytes // 8
-                if count > most:
-                    raise ValueError(f"more than {most} numbers")
-                batches.append(batch)
-            table = pa.Table.from_batches(batches, opened.schema_arrow.empty_table().select(wanted).schema)
-        arrays = {name: _array(table.column(name)) for name in wanted}
+        arrays, _ = columns_of(file, wanted, most, "lerobot")
         index = arrays["episode_index"]
         if index.ndim != 1 or not np.all((index >= 0) & (index < 2**31) & (index % 1 == 0)):
             raise ValueError("episode_index is not a column of whole numbers")
@@ -144,29 +130,6 @@ def _read_file(file: Path, features: Mapping[str, Any], most: int) -> list[tuple
             (int(n), {name: values[episode == n] for name, values in arrays.items()})
             for n in np.unique(episode)
         ]
-
-
-def _check_extent(metadata: Any, columns: int, most: int) -> None:
-    """Check the announced size of a file's data, since a run of one value takes no bytes in it.
-
-    The metadata of single columns are not read: pyarrow ends the process if these are damaged.
-    """
-    size = sum(metadata.row_group(group).total_byte_size for group in range(metadata.num_row_groups))
-    if metadata.num_rows * columns > most or size > 8 * most:
-        raise ValueError(f"more than {most} numbers")
-
-
-def _array(column: Any) -> FloatArray:
-    """Return a Parquet column, (T,) for numbers, (T, K) for lists of equal length."""
-    import pyarrow as pa
-
-    whole = column.combine_chunks()
-    if isinstance(whole, pa.ChunkedArray):
-        whole = pa.concat_arrays(whole.chunks) if whole.num_chunks else pa.array([], whole.type.value_type)
-    if pa.types.is_list(whole.type) or pa.types.is_fixed_size_list(whole.type):
-        flat = as_floats(whole.flatten().to_numpy(zero_copy_only=False))
-        return flat.reshape(len(whole), -1) if len(whole) else np.empty((0, 1))
-    return as_floats(whole.to_numpy(zero_copy_only=False))
 
 
 def _joined(parts: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:

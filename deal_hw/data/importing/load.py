@@ -33,6 +33,11 @@ _CSV = "deal_hw.data.importing.csv_source:read_csv"
 _READERS = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".csv.gz", ".tsv.gz", ".txt.gz"), _CSV),
     ".npz": "deal_hw.data.importing.npz_source:read_npz",
+    **dict.fromkeys((".parquet", ".pq"), "deal_hw.data.importing.parquet_source:read_parquet"),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), "deal_hw.data.importing.json_source:read_json_table"),
+    **dict.fromkeys((".h5", ".hdf5"), "deal_hw.data.importing.hdf5_source:read_hdf5"),
+    ".mat": "deal_hw.data.importing.mat_source:read_mat",
+    ".bag": "deal_hw.data.importing.ros1_source:read_ros1_bag",
     ".mcap": "deal_hw.data.importing.mcap_source:read_mcap",
     ".db3": "deal_hw.data.importing.bag_source:read_bag",
 }
@@ -66,7 +71,8 @@ def read_channels(path: Path, say: Say | None = None) -> list[Channels]:
             f"known: {', '.join(_READERS)}, and LeRobot folders"
         )
     module, _, function = reader.partition(":")
-    return [getattr(importlib.import_module(module), function)(path)]
+    found = getattr(importlib.import_module(module), function)(path)
+    return list(found) if isinstance(found, list) else [found]
 
 
 def _read_folder(path: Path, say: Say | None) -> list[Channels]:

@@ -27,7 +27,7 @@ MAGIC = b"\x89MCAP0\r\n"
 """First bytes of an MCAP file (mcap.dev/spec)."""
 CHUNK_BYTES = 64 * MIB
 """Largest record, and largest chunk once it is unpacked; recorders write chunks of 1 to 4 MiB."""
-_LEAF_COST = 16
+LEAF_COST = 16
 """Additional memory of a field of a message, in numbers, beside its values."""
 LIST_BYTES = MIB
 """Largest message with a list of messages; a trajectory of ten thousand points."""
@@ -109,7 +109,7 @@ def channels_of(
         row = dict(_fields(decode(message.data)))
         row["log_time"] = message.log_time
         row["name"] = named(row)
-        budget -= sum(_LEAF_COST + (len(v) if is_list(v) else 0) for v in row.values())
+        budget -= sum(LEAF_COST + (len(v) if is_list(v) else 0) for v in row.values())
         if budget < 0:
             raise ValueError(f"more than {NUMBERS} numbers; keep the joints' topics (`mcap filter`)")
         topics.setdefault(channel.topic, []).append(row)
@@ -161,7 +161,7 @@ def _readable(channel: Channel, schema: Schema | None, factory: DecoderFactory) 
         return f"the bag holds no definition of {kind}", None
     if schema.encoding != SchemaEncoding.ROS2:
         return f"its definition is {short(schema.encoding, 40)}, not {SchemaEncoding.ROS2}", None
-    if reason := _costs(schema):
+    if reason := reason_of(schema):
         return reason, None
     try:
         factory.decoder_for(channel.message_encoding, schema)
@@ -170,7 +170,7 @@ def _readable(channel: Channel, schema: Schema | None, factory: DecoderFactory) 
     return "", schema
 
 
-def _costs(schema: Schema) -> str:
+def reason_of(schema: Schema) -> str:
     """Return why messages of a schema may take more time or memory than they have bytes; "" if they do not.
 
     The decoder follows the schema alone. A list of empty messages may have four thousand million entries, and
