@@ -31,12 +31,15 @@ class ImportSettings(Checked):
     """Settings of :func:`import_recordings`."""
 
     paths: tuple[Path, ...]
-    """Recordings of one robot: CSV, NPZ, MCAP or db3 files, folders of LeRobot datasets or ROS 2 bags,
-    episodes and datasets of deal-hw."""
+    """Recordings of one robot: CSV, NPZ, JSON, Parquet, HDF5 or MAT files, bags of ROS 1 and 2, folders of
+    LeRobot datasets, episodes and datasets of deal-hw."""
     out: Path
     """The dataset to make, or to add to."""
     columns: Path | None = None
     """A column map (YAML). Without it the channels' meaning is guessed from their names, and printed."""
+    lerobot: Path | None = None
+    """LeRobot's calibration of a servo arm (JSON of lerobot-calibrate): it turns the -100..100 or the degrees
+    of its datasets into radians. Needs --model or --robot."""
     model: Path | None = None
     """The robot's MJCF, which gives joint names, order and limits. The dataset keeps a copy."""
     robot: Path | None = None
@@ -95,6 +98,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.recording.dataset_index import entry_of_episode
     from deal_hw.data.recording.episode_info import verdict_json
     from deal_hw.data.table import table_of
+    from deal_hw.workflows.lerobot_columns import columns_of_lerobot
     from deal_hw.workflows.ros2_columns import columns_of_robot
 
     _refuse_ignored(config)
@@ -105,6 +109,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     if columns is None and robot is not None and robot.file.ros2 is not None:
         columns = functools.partial(columns_of_robot, robot.file, robot.file.ros2)
     facts = _joint_facts(config.model if robot is None else robot.mjcf, say)
+    columns = columns_of_lerobot(config.lerobot, facts, columns is not None) or columns
     described = None if config.description is None else _description(config.description)
     joints = None if facts is None else facts.names
     if robot is not None:

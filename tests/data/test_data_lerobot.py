@@ -21,8 +21,10 @@ from deal_hw.data.importing.grid import period_of, to_trajectories
 from deal_hw.data.importing.lerobot_source import read_lerobot
 from deal_hw.data.importing.load import load_tables
 from deal_hw.data.table import Table
-from deal_hw.errors import DatasetError
+from deal_hw.errors import ConfigurationError, DatasetError
+from deal_hw.sim.mjcf.joint_facts import joint_facts
 from deal_hw.types import Trajectory
+from deal_hw.workflows.lerobot_columns import LeRobotColumns, columns_of_lerobot
 
 MakeTable = Callable[..., Table]
 MakeTrajectory = Callable[..., Trajectory]
@@ -334,3 +336,83 @@ def test_a_dataset_has_so_many_numbers_at_most(
             read_lerobot(folder, most_numbers=limit)
     else:
         assert read_lerobot(folder, most_numbers=limit)[0].arrays["action"].shape == (60, 3)
+
+
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="pan" type="hinge" axis="0 0 1" range="-1.5 1.9"/>
+<geom size=".1" mass="1"/><body pos="0 0 .2"><joint name="gripper" type="hinge" axis="0 1 0" range="0 2"/>
+<geom size=".1" mass="1"/></body></body></worldbody><actuator><position joint="pan" kp="10"/>
+<position joint="gripper" kp="10"/></actuator></mujoco>"""
+TICK = 2 * np.pi / 4096
+
+
+def servo_arm(folder: Path, state: np.ndarray, robot: str) -> Path:
+    """Write a dataset of LeRobot, (T, 2), whose info names no unit, and return its folder."""
+    feature = {"dtype": "float32", "shape": [2], "names": ["pan.pos", "gripper.pos"]}
+    info = {"codebase_version": "v3.0", "fps": 100, "robot_type": robot}
+    info["features"] = {"observation.state": feature, "action": feature}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    (folder / "data/chunk-000").mkdir(parents=True)
+    frame = np.arange(len(state))
+    columns = {"observation.state": list(state), "action": list(state + 0.5), "frame_index": frame}
+    table = pa.table({**columns, "episode_index": np.zeros(len(state), int)})
+    pq.write_table(table, folder / "data/chunk-000/file-000.parquet")
+    return folder
+
+
+@pytest.mark.parametrize("robot", ["so101_follower", "so100", "koch", ""])
+def test_servo_arms_without_a_unit_are_never_in_radians(tmp_path: Path, robot: str) -> None:
+    """Small motions of a known arm, and values that no joint reaches in radians, are refused."""
+    size = 1.0 if robot else 90.0
+    state = size * np.stack([np.sin(np.arange(300) / 30), np.cos(np.arange(300) / 40) ** 2], axis=1)
+    with pytest.raises(DatasetError, match=r"never radians: give the arm's calibration \(--lerobot"):
+        load_tables(servo_arm(tmp_path / "d", state, robot), joints=("pan", "gripper"))
+
+
+@pytest.mark.parametrize(
+    ("travel", "most", "unit"),
+    [(1600, 95.0, "share"), (3600, 150.0, "deg"), (3600, 90.0, None), (800, 150.0, "other")],
+)
+@pytest.mark.parametrize("drive_mode", [0, 1])
+def test_calibration_gives_the_scale(
+    tmp_path: Path, travel: int, most: float, unit: str | None, drive_mode: int
+) -> None:
+    """Values beyond 100 are degrees, beyond the travel in degrees shares of it; else the user must say."""
+    pytest.importorskip("mujoco")
+    state = np.stack([most * np.sin(np.arange(300) / 30), 50 + 40 * np.cos(np.arange(300) / 40)], axis=1)
+    data = servo_arm(tmp_path / "d", state, "so101_follower")
+    motor = {"drive_mode": drive_mode, "homing_offset": 0, "range_min": 2000 - travel // 2}
+    motors = {"pan": {"id": 1, **motor, "range_max": 2000 + travel // 2}}
+    motors["gripper"] = {"id": 2, **motor, "range_min": 1000, "range_max": 2200}
+    (tmp_path / "arm.json").write_text(json.dumps(motors))
+    (tmp_path / "arm.xml").write_text(ARM)
+    calibration = LeRobotColumns(tmp_path / "arm.json", joint_facts(tmp_path / "arm.xml"))
+    if unit is None or unit == "other":
+        with pytest.raises(
+            DatasetError, match="may be -100..100" if unit is None else "neither -100..100 nor"
+        ):
+            load_tables(data, calibration, ("pan", "gripper"))
+        return
+    (table,) = load_tables(data, calibration, ("pan", "gripper"))
+    turn = (
+        np.radians(state[:, 0]) * (-1) ** drive_mode
+        if unit == "deg"
+        else state[:, 0] / 100 * travel / 2 * TICK
+    )
+    # The middle of the travel is the middle of the model's range; a gripper of 100 is open by its travel.
+    np.testing.assert_allclose(table.position[:, 0], 0.2 + turn, atol=1e-6)
+    np.testing.assert_allclose(table.position[:, 1], 1.0 + (state[:, 1] / 100 - 0.5) * 1200 * TICK, atol=1e-6)
+
+
+def test_calibration_of_another_arm_is_refused(tmp_path: Path) -> None:
+    """The motors are named; a calibration without a model has no zero."""
+    pytest.importorskip("mujoco")
+    data = servo_arm(tmp_path / "d", np.full((30, 2), 120.0), "so101")
+    motor = {"id": 1, "drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3000}
+    (tmp_path / "arm.json").write_text(json.dumps({"elbow": motor}))
+    (tmp_path / "arm.xml").write_text(ARM)
+    calibration = LeRobotColumns(tmp_path / "arm.json", joint_facts(tmp_path / "arm.xml"))
+    with pytest.raises(DatasetError, match="has no motor pan, gripper; its motors: elbow"):
+        load_tables(data, calibration, ("pan", "gripper"))
+    with pytest.raises(ConfigurationError, match="add --model or --robot"):
+        columns_of_lerobot(tmp_path / "arm.json", None, mapped=False)

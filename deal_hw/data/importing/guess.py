@@ -224,7 +224,13 @@ def _from_arrays(
         time = _guess_time(channels, channels.arrays, (f"{topic}.",)) or time
         command_time = _guess_command_time(channels, arrays["target"].channel) if "target" in arrays else None
     unit = arrays["position"].unit or "rad"
-    units = channels.units.get(array, ())
+    units = tuple(_GIVEN_UNITS.get(given.lower(), given) for given in channels.units.get(array, ()))
+    units = units * width if len(units) == 1 else units
+    if strange := [given for given in units if given and given not in POSITION_UNITS]:
+        raise DatasetError(
+            f"{channels.path}: the unit of {array!r} is {short(strange[0], 160)}; known are "
+            f"{', '.join(POSITION_UNITS)}. Or write each joint's scale into a column map (unit or normalised)"
+        )
     units = units if len(units) == width and set(units) <= set(POSITION_UNITS) else (unit,) * width
     by_role = {role: guess.channel for role, guess in arrays.items()}
     return ColumnMap(

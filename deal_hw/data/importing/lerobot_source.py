@@ -9,7 +9,8 @@ features. The action of a frame is sent right after the frame was observed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -27,6 +28,16 @@ from deal_hw.types import FloatArray
 FLOAT32_STAMP_S = 1e-4
 """Stamps closer than this to frame_index / fps are its float32 rounding [s]."""
 _DEEPEST = 8
+_JOINTS = ("observation.state", "action")
+_SERVO_ARMS = re.compile(r"(bi_)?(so_?\d|so_|koch|lekiwi|omx|moss)")
+"""Beginnings of the robot types whose servos LeRobot reads without radians."""
+SERVO_UNIT = (
+    "LeRobot's -100..100 of the travel, or degrees, never radians: give the arm's calibration "
+    "(--lerobot FILE.json)"
+)
+"""Stands for the unit that LeRobot's datasets of servo arms do not name."""
+MOST_RAD = 4 * np.pi
+"""Joints of an arm do not turn farther; greater values are no radians [rad]."""
 _DROPPED = ("index", "task_index", "episode_index", "frame_index")
 
 
@@ -73,28 +84,40 @@ def read_lerobot(
         units = {
             name: tuple(map(short, _flat(f.get("units"), _DEEPEST))) for name, f in info.features.items()
         }
+    joined = {episode: _joined(parts) for episode, parts in found.items()}
+    if not any(units.values()) and _no_radians(info, joined.values()):
+        units = {name: (SERVO_UNIT,) * len(names) for name, names in labels.items() if name in _JOINTS}
     return [
         Channels(
             path=path,
             kind="lerobot",
             digest=digest,
-            arrays=_stamped(_joined(parts), info.fps),
+            arrays=_stamped(arrays, info.fps),
             labels={name: names for name, names in labels.items() if names},
             units={name: given for name, given in units.items() if given},
             part=f"episode {episode}",
         )
-        for episode, parts in sorted(found.items())
+        for episode, arrays in sorted(joined.items())
     ]
+
+
+def _no_radians(info: _Info, episodes: Iterable[dict[str, FloatArray]]) -> bool:
+    """Return whether positions without a unit cannot be radians, by the kind of robot or by their size."""
+    if _SERVO_ARMS.match((info.robot_type or "").lower()):
+        return True
+    states = [arrays[_JOINTS[0]] for arrays in episodes if _JOINTS[0] in arrays]
+    return any(float(np.max(np.abs(state[np.isfinite(state)]), initial=0.0)) > MOST_RAD for state in states)
 
 
 @dataclass(frozen=True, slots=True)
 class _Info:
-    """The used part of ``meta/info.json``: the features by name, and the rate [Hz]."""
+    """The used part of ``meta/info.json``: the features by name, the rate [Hz] and the kind of robot."""
 
     __pydantic_config__: ClassVar[Mapping[str, Any]] = OPEN
 
     features: dict[str, dict[str, Any]]
     fps: float
+    robot_type: str | None = None
 
     def __post_init__(self) -> None:
         if not 1e-3 <= self.fps <= 1e6:

@@ -35,7 +35,7 @@ def build_table(channels: Channels, columns: ColumnMap, joints: Sequence[str] | 
     ordered = _ordered(channels, columns, joints)
     time_s, command_s = _times(channels, columns)
     measured = {
-        kind: [_joint_channel(channels, columns, joint, place, kind) for joint, place in ordered]
+        kind: [joint_channel(channels, columns, joint, place, kind) for joint, place in ordered]
         for kind in ("position", "velocity", "effort", "target")
     }
     absent = [
@@ -161,7 +161,7 @@ def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArr
     return time_s, (channels.column(columns.command_time.column) - zero * (unit / its_unit)) * its_unit
 
 
-def _joint_channel(
+def joint_channel(
     channels: Channels, columns: ColumnMap, joint: JointColumns, place: int, kind: str
 ) -> FloatArray | None:
     """Return one quantity of one joint in SI, (T,); None if the map or the file has none."""
