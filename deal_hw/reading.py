@@ -43,7 +43,7 @@ YAML_NODES: Final = 100_000
 YAML_TEXT: Final = 10_000
 """Longest single text of a YAML file [characters]."""
 RECORDING_BYTES: Final = 1024 * MIB
-"""Largest file of a foreign recording (CSV, NPZ, MCAP)."""
+"""Largest file of a foreign recording."""
 NUMBERS: Final = 1 << 27
 """Most numbers of one recording: 1 GiB, as 30 joints with five quantities at 1 kHz give in 15 minutes."""
 NAMES: Final = 4096

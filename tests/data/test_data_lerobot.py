@@ -338,7 +338,8 @@ def test_a_dataset_has_so_many_numbers_at_most(
         assert read_lerobot(folder, most_numbers=limit)[0].arrays["action"].shape == (60, 3)
 
 
-ARM = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="pan" type="hinge" axis="0 0 1" range="-1.5 1.9"/>
+ARM = """<mujoco><compiler angle="radian"/><worldbody><body>
+<joint name="pan" type="hinge" axis="0 0 1" range="-1.5 1.9"/>
 <geom size=".1" mass="1"/><body pos="0 0 .2"><joint name="gripper" type="hinge" axis="0 1 0" range="0 2"/>
 <geom size=".1" mass="1"/></body></body></worldbody><actuator><position joint="pan" kp="10"/>
 <position joint="gripper" kp="10"/></actuator></mujoco>"""

@@ -137,6 +137,23 @@ def test_measurement_that_copies_the_command(make_table: MakeTable) -> None:
     assert found.severity is Severity.FAIL and "3 samples later" in found.message
 
 
+def test_command_that_copies_the_measurement(make_table: MakeTable) -> None:
+    """A log of readings in place of the commands: they follow the motion."""
+    table = make_table()
+    target = np.roll(table.position[:, list(table.actuated_index)], 2, axis=0)
+    found = verdict(dataclasses.replace(table, command_s=table.time_s, target=target), "copy")
+    assert found.severity is Severity.FAIL and "commands that are a copy of the measured" in found.message
+
+
+def test_command_that_stands_while_its_joint_moves(make_table: MakeTable) -> None:
+    """One column without any change is named; the others are commands."""
+    table = make_table()
+    target = table.target.copy()
+    target[:, 1] = 0.5
+    found = verdict(dataclasses.replace(table, target=target), "commands")
+    assert found.severity is Severity.WARN and "never changes although the joint moves: knee" in found.message
+
+
 def test_degrees(make_table: MakeTable) -> None:
     """Degrees in either channel are found by the factor between them, in both by the limits."""
     sound = make_table()

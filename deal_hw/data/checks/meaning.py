@@ -54,21 +54,41 @@ def check_commands(table: Table, efforts: bool) -> Finding:
     ]
     if len(still) == len(table.actuated) and not efforts:
         return Finding("commands", Severity.FAIL, f"{text}; no command ever changes: record a motion")
+    moved = {name: _span(table.position[:, table.joint_names.index(name)]) for name in still}
+    moved = {
+        name: span
+        for name, span in moved.items()
+        if span > 5 * MOVES[table.units[table.joint_names.index(name)]]
+    }
+    if moved and not efforts:
+        each = ", ".join(
+            f"{name} (moves over {span:.3g} {table.units[table.joint_names.index(name)]})"
+            for name, span in moved.items()
+        )
+        return Finding(
+            "commands",
+            Severity.WARN,
+            f"the command never changes although the joint moves: {each}",
+            "check that the column has its command; if it was moved by hand or by other joints, all is well",
+        )
     return Finding("commands", Severity.OK, text)
 
 
 def check_copy(table: Table) -> Finding:
-    """Check that measured positions are no copy of the commands."""
+    """Check that measured positions are no copy of the commands, nor commands one of earlier positions."""
     held, measured = table.target_at(table.time_s), table.position[:, list(table.actuated_index)]
-    copied = []
+    copied, echoed = [], []
     for column, name in enumerate(table.actuated):
-        for lag in range(6):
-            ahead = held[: held.shape[0] - lag, column]
-            behind = measured[lag:, column]
-            moving = np.abs(np.diff(behind, prepend=behind[0])) > 0
-            if np.sum(moving) > 20 and np.mean(np.abs(ahead - behind)[moving] < 1e-7) > 0.9:
-                copied.append(f"{name}, {lag} samples later" if lag else name)
-                break
+        if (lag := _copied(held[:, column], measured[:, column])) is not None:
+            copied.append(f"{name}, {lag} samples later" if lag else name)
+        elif (lag := _copied(measured[:, column], held[:, column])) is not None:
+            echoed.append(f"{name}, {lag} samples later")
+    if echoed:
+        text = (
+            f"commands that are a copy of the measured position: {', '.join(echoed)}; such a command follows "
+            "the motion and cannot have caused it: name the column of the commands that were sent"
+        )
+        return Finding("copy", Severity.FAIL, text)
     if not copied:
         return Finding("copy", Severity.OK, "measured and commanded positions differ")
     text = (
@@ -76,6 +96,16 @@ def check_copy(table: Table) -> Finding:
         "is wrong: correct the column map"
     )
     return Finding("copy", Severity.FAIL, text)
+
+
+def _copied(first: FloatArray, second: FloatArray) -> int | None:
+    """Return after how many samples a moving channel repeats another one, 0 to 5; None if it does not."""
+    for lag in range(6):
+        ahead, behind = first[: len(first) - lag], second[lag:]
+        moving = np.abs(np.diff(behind, prepend=behind[0])) > 0
+        if np.sum(moving) > 20 and np.mean(np.abs(ahead - behind)[moving] < 1e-7) > 0.9:
+            return lag
+    return None
 
 
 def check_slip(table: Table) -> Finding:

@@ -1,4 +1,4 @@
-"""Recordings of any robot: CSV, NPZ, MCAP and LeRobot files become :class:`~deal_hw.types.Trajectory`.
+"""Recordings of any robot: files of many kinds become :class:`~deal_hw.types.Trajectory`.
 
 A source reads a file into named channels. A column map gives each channel its meaning. A
 :class:`~deal_hw.data.table.Table` contains the result in SI units, and

@@ -37,6 +37,8 @@ EFFORT_UNITS: Mapping[str, float] = {"N": 1.0, "Nm": 1.0}
 """Unit of a motor's target -> newtons or newton metres."""
 SPEED_UNITS: Mapping[str, float] = {f"{unit}/s": factor for unit, factor in POSITION_UNITS.items()}
 """Unit of a velocity servo's target -> radians or metres a second."""
+MOST_SHIFT_S = 2.0
+"""Largest shift of commands [s]; a longer one is another clock."""
 QUATERNION_ORDERS = ("wxyz", "xyzw")
 FRAMES = ("world", "base")
 
@@ -253,6 +255,8 @@ class ColumnMap:
         velocity: The same; None where there is none.
         effort: The same; None where there is none.
         command_time: Time of the commands if they have their own stamps.
+        command_shift_s: Added to the stamps of the commands [s]: minus one period where each command is in
+            the row after the one in which it was sent.
         orientation: Quaternion of the base.
         gyro: Angular velocity of the base in its own frame.
         base_position: Place of the base in the world: the origin of the free joint's body.
@@ -267,6 +271,7 @@ class ColumnMap:
     velocity: str | None = None
     effort: str | None = None
     command_time: TimeColumn | None = None
+    command_shift_s: float = 0.0
     orientation: Vector | None = None
     gyro: Vector | None = None
     base_position: Vector | None = None
@@ -324,6 +329,9 @@ def parse_column_map(values: Any, source: tuple[str, ...] = ()) -> ColumnMap:
     return ColumnMap(
         time=None if top.get("time") is None else _time("time", top["time"]),
         command_time=None if command_time is None else _time("command_time", command_time),
+        command_shift_s=number(
+            top.get("command_shift_s", 0.0), "command_shift_s", -MOST_SHIFT_S, MOST_SHIFT_S
+        ),
         joints=tuple(_joint(entry, defaults) for entry in top["joints"]),
         orientation=_vector("orientation", top.get("orientation"), 4),
         gyro=_vector("gyro", top.get("gyro"), 3),

@@ -104,7 +104,7 @@ def load_tables(
     """Read the recordings in a file, in SI units, on their own stamps.
 
     Args:
-        path: A CSV, NPZ or MCAP file, our own episode, or the folder of our own dataset, of LeRobot's or of a
+        path: A file of a known kind, our own episode, or the folder of our own dataset, of LeRobot's or of a
             ROS 2 bag.
         columns: Meaning of its channels, or what returns it; None: guessed from their names.
         joints: Names of the model's joints; None: those of the map, or of the file.

@@ -156,9 +156,11 @@ def _times(channels: Channels, columns: ColumnMap) -> tuple[FloatArray, FloatArr
     zero = float(finite[0]) if finite.size else 0.0
     time_s = (raw - zero) * unit
     if columns.command_time is None:
-        return time_s, time_s
+        return time_s, time_s + columns.command_shift_s
     its_unit = TIME_UNITS[columns.command_time.unit]
-    return time_s, (channels.column(columns.command_time.column) - zero * (unit / its_unit)) * its_unit
+    return time_s, (
+        channels.column(columns.command_time.column) - zero * (unit / its_unit)
+    ) * its_unit + columns.command_shift_s
 
 
 def joint_channel(

@@ -236,11 +236,14 @@ def _checked(
 ) -> CalibrationResult:
     """Return the result with the alarm on its latency, its start states and its held-out errors."""
     from deal_hw.calib.validation.checks import latency_alarms
+    from deal_hw.workflows.calibration.late_commands import late_commands
 
     safely, provenance = SafeChecks(), result.provenance
     first, last = provenance.get("grown_ranges", {}).get(LATENCY, problem.latency_range_s)
     more = safely.run("the latency's range", (), latency_alarms, problem, result.latency_s, (first, last))
-    if _in_loop(problem, method):
+    if not _in_loop(problem, method):
+        more += safely.run("the rows of the commands", (), late_commands, problem, result)
+    else:
         provenance = {
             **provenance,
             "start_states": "recorded" if problem.start_std is None else "drawn",

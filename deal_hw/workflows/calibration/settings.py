@@ -347,7 +347,7 @@ class Recordings(Divided):
     """The robot's MJCF. Its position actuators (or motors) take the recorded commands."""
 
     data: tuple[Path, ...] = ()
-    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders."""
+    """Recordings to fit: files that `data import` reads, or LeRobot folders."""
 
     columns: File | None = None
     """Column map (YAML; docs/how-to/import.md). Without one, the meaning of the
@@ -400,7 +400,7 @@ class FilesSettings(UserRobotSettings, Recordings):
     ``mujoco.MjSpec``, or the last compiled ``mujoco.MjModel``."""
 
     data: Any = field(default=(), kw_only=False)
-    """Recordings to fit: CSV, NPZ or MCAP files, or LeRobot folders. From Python one or several, also
+    """Recordings to fit: files that `data import` reads, or LeRobot folders. From Python one or several, also
     mappings of names to arrays and data frames: positions [rad or m] (T, J), commands (T, A), time [s]
     (T,)."""
 
