@@ -146,6 +146,7 @@ class RobotDescription:
         mjcf: The robot's MuJoCo model.
         actuation: "position": commands are set-points of a PD loop; "motor": commands are efforts, -1..1 of
             ``effort_limit``, and stiffness and damping are 0.
+        motors: Actuated joints of a robot of "position" that take efforts all the same, as in ``"motor"``.
         floating_base: Name of the free joint that carries the robot; None for a fixed base. It is not among
             ``joint_names``.
         passive_damping: kd of the passive command, (A,) [N·m·s/rad], for robots whose passive state is
@@ -180,6 +181,7 @@ class RobotDescription:
     rest_position: tuple[float, ...] = ()
     feet: tuple[str, ...] = ()
     excitation_range: tuple[tuple[float, float], ...] = ()
+    motors: tuple[str, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -191,6 +193,12 @@ class RobotDescription:
         if self.actuation not in ACTUATIONS:
             raise ConfigurationError(
                 f"robot {self.name!r}: actuation is {self.actuation!r}; allowed: {', '.join(ACTUATIONS)}"
+            )
+        unknown = [name for name in self.motors if name not in self.actuated or self.actuation == "motor"]
+        if unknown:
+            raise ConfigurationError(
+                f"robot {self.name!r}: motors names {unknown}; it names actuated joints of a robot whose "
+                "other joints are servos"
             )
         if self.floating_base in self.joint_names:
             raise ConfigurationError(
@@ -228,6 +236,15 @@ class RobotDescription:
     def actuated_index(self) -> tuple[int, ...]:
         """Index of each actuated joint among the joints, (A,)."""
         return tuple(self.joint_names.index(name) for name in self.actuated)
+
+    @property
+    def servos(self) -> tuple[bool, ...]:
+        """Whether each actuated joint takes positions, (A,); the others take efforts."""
+        return tuple(self.actuation == "position" and name not in self.motors for name in self.actuated)
+
+    def held(self, position: FloatArray) -> FloatArray:
+        """Return the commands that hold joint positions, (..., J): for motors no effort, (..., A)."""
+        return np.where(self.servos, position[..., list(self.actuated_index)], 0.0)
 
     def in_climb(self) -> RobotDescription:
         """Return the robot with its limits for climbing in force."""

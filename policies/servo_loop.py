@@ -127,9 +127,7 @@ class ServoLoop:
         self.set_state(position, velocity, members)
         start = setpoint
         if start is None:
-            start = position[:, self.batch.robot.joints][:, list(self.description.actuated_index)]
-            if self.description.actuation == "motor":
-                start = np.zeros_like(start)
+            start = self.description.held(position[:, self.batch.robot.joints])
         self._loop.restart(start, latency_s, members)
         period_s = 1.0 / self.description.control_rate_hz
         for age in range(self._window + 1):

@@ -146,7 +146,7 @@ def _variants(
     fast = 1.0
     if np.isfinite(description.speed_limit).all():
         fast = min(HIGH_SPEED, largest_factor(description.speed_limit, description.limits.speed))
-    if description.actuation == "position" and np.isfinite(description.effort_limit).all():
+    if all(description.servos) and np.isfinite(description.effort_limit).all():
         found.append(((LOW_EFFORT, 1.0), (fast, 1.0)))
     if fast > 1.0:
         found.append((one, (fast, 1.0)))
@@ -308,8 +308,8 @@ def _described(
     spare = BEYOND * (most - least)
     fastest = np.max([np.abs(s.velocity).max(axis=0) for s in problem.starts], axis=0)
     home = 0.5 * (least + most)
-    if description.actuation == "position":
-        home[list(description.actuated_index)] = 0.5 * (low + high)
+    index, servos = np.array(description.actuated_index, dtype=int), np.array(description.servos, dtype=bool)
+    home[index[servos]] = 0.5 * (low + high)[servos]
     limits = dataclasses.replace(
         description.limits,
         target=_pairs(low, high),

@@ -114,9 +114,8 @@ class TrialRunner:
         loop = _Loop(description, scenario.position, self._trip_share)
         positions, velocities = [self._batch.position[:, None]], [self._batch.velocity[:, None]]
         path = ClosedLoop(self._batch, self._period, self._device_s)
-        start = scenario.position[:, list(description.actuated_index)]
+        path.restart(description.held(scenario.position), scenario.latency_s)
         motor = description.actuation == "motor"
-        path.restart(np.zeros_like(start) if motor else start, scenario.latency_s)
         speed = self._batch.servo_factor("servo_speed_limit")
         for tick in range(self._ticks):
             sent = loop.command(behaviours, positions[-1][:, -1], velocities[-1][:, -1], tick)

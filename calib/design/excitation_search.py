@@ -189,7 +189,7 @@ class _Designer:
         self._top_hz = min(TOP_HZ, description.control_rate_hz / TICKS_A_CYCLE)
         # Factors on effort and speed limits; 1 to 1 where there is no such limit.
         self._effort, self._speed = (LOWEST_EFFORT, 1.0), (1.0, 1.0)
-        if description.actuation != "position" or not np.isfinite(description.effort_limit).all():
+        if not all(description.servos) or not np.isfinite(description.effort_limit).all():
             self._effort = (1.0, 1.0)
         if np.isfinite(description.speed_limit).all():
             self._speed = (0.4, largest_factor(description.speed_limit, description.limits.speed))

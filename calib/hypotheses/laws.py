@@ -102,13 +102,13 @@ def _at_limits(problem: Problem) -> list[Parameter]:
 
 def _play(problem: Problem) -> list[Parameter]:
     here = any(_searched(problem, kind) for kind in ("servo_play", TRANSMISSION_STIFFNESS))
-    if problem.robot.description.actuation != "position" or here:
+    if here:
         return []
     span = np.max([np.ptp(e.target, axis=0) for e in problem.episodes], axis=0)
     return [
         _parameter(problem, "servo_play", name, 0.0, 0.0, MOST_PLAY * float(most))
         for name, most in zip(problem.robot.actuator_names, span, strict=True)
-        if most > 0
+        if most > 0 and _usable(problem, "servo_play", name)
     ]
 
 
@@ -170,22 +170,23 @@ def _lag(problem: Problem) -> list[Parameter]:
 
 
 def _motor(problem: Problem) -> list[Parameter]:
-    if problem.robot.description.actuation != "motor" or _searched(problem, "command_asymmetry"):
+    if _searched(problem, "command_asymmetry"):
         return []
-    names = problem.robot.actuator_names
     return [
-        _parameter(problem, "command_asymmetry", name, 0.0, -MOST_ASYMMETRY, MOST_ASYMMETRY) for name in names
+        _parameter(problem, "command_asymmetry", name, 0.0, -MOST_ASYMMETRY, MOST_ASYMMETRY)
+        for name in problem.robot.actuator_names
+        if _usable(problem, "command_asymmetry", name)
     ]
 
 
 def _motor_dead_zone(problem: Problem) -> list[Parameter]:
-    if problem.robot.description.actuation != "motor" or _searched(problem, "command_dead_zone"):
+    if _searched(problem, "command_dead_zone"):
         return []
     sent = np.max([np.max(np.abs(e.target), axis=0) for e in problem.episodes], axis=0)
     return [
         _parameter(problem, "command_dead_zone", name, 0.0, 0.0, MOST_DEAD_ZONE * float(most))
         for name, most in zip(problem.robot.actuator_names, sent, strict=True)
-        if most > 0
+        if most > 0 and _usable(problem, "command_dead_zone", name)
     ]
 
 
@@ -216,7 +217,7 @@ def _scale(problem: Problem) -> list[Parameter]:
     if _searched(problem, ENCODER_SCALE):
         return []
     facts = problem.robot.description
-    servos = facts.actuated if facts.actuation == "position" else ()
+    servos = [name for name, servo in zip(facts.actuated, facts.servos, strict=True) if servo]
     # In the loop of a servo a scale looks as other gains and inertias do.
     return [
         _parameter(problem, ENCODER_SCALE, name, 1.0, 1 / MOST_SCALE, MOST_SCALE, scale="log")

@@ -84,28 +84,28 @@ class ChannelChange:
         """Return the identity."""
         return cls(source=tuple(range(joints)), scale=(1.0,) * joints)
 
-    def of(self, episode: SampledEpisode, actuated: Sequence[int], *, efforts: bool) -> SampledEpisode:
+    def of(self, episode: SampledEpisode, actuated: Sequence[int], servos: Sequence[bool]) -> SampledEpisode:
         """Return the changed recording of a fixed-base robot; gains and limits stay.
 
-        Only the actuated joints, (A,), exchange commands. ``efforts``: commands are efforts, not positions.
+        Only the actuated joints, (A,), exchange commands. ``servos``: which of them take positions, not
+        efforts.
         """
         joints, scale = list(self.source), np.array(self.scale)
         actuators = [list(actuated).index(self.source[joint]) for joint in actuated]
-        sent = np.sign(scale) if efforts else scale
+        sent = np.where(servos, scale[list(actuated)], np.sign(scale[list(actuated)]))
         return dataclasses.replace(
             episode,
             step_s=self.clock * episode.step_s,
             position=scale * episode.position[:, joints],
             velocity=scale / self.clock * episode.velocity[:, joints],
-            target=sent[list(actuated)] * episode.target[:, actuators],
-            start_setpoint=sent[list(actuated)] * episode.start_setpoint[actuators],
+            target=sent * episode.target[:, actuators],
+            start_setpoint=sent * episode.start_setpoint[actuators],
         )
 
     def on(self, problem: Problem, episodes: Sequence[SampledEpisode]) -> Problem:
         """Return the problem of changed recordings of a fixed-base robot, with the noise scaled alike."""
         facts, robot = problem.robot.description, problem.robot
-        motor = facts.actuation == "motor"
-        changed = [self.of(e, facts.actuated_index, efforts=motor) for e in episodes]
+        changed = [self.of(e, facts.actuated_index, facts.servos) for e in episodes]
         joints, scale = list(self.source), np.abs(self.scale)
         position, velocity = np.split(problem.noise_std, 2)
         std = np.concatenate([scale * position[joints], scale / self.clock * velocity[joints]])

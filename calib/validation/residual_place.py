@@ -117,7 +117,7 @@ def quantities(problem: Problem, latency_s: float) -> list[Quantity]:
         speed = tuple(s.velocity[:, c] for s in problem.starts)
         found.append(Quantity("speed", name, f"{unit}/s", speed))
         if name in driven:
-            own = "" if facts.actuation == "motor" else unit
+            own = unit if facts.servos[driven[name]] else ""
             acting = tuple(_acting(e, latency_s)[:, driven[name]] for e in problem.episodes)
             found.append(Quantity("command", name, own, acting))
         if loads:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,6 +94,13 @@ class Table:
             actuated=tuple(actuated),
             target=self.target[:, columns],
             **arrays,
+        )
+
+    def commanded(self, names: Collection[str]) -> Table:
+        """Return the recording with the commands of these joints only."""
+        columns = [a for a, name in enumerate(self.actuated) if name in names]
+        return dataclasses.replace(
+            self, actuated=tuple(self.actuated[a] for a in columns), target=self.target[:, columns]
         )
 
     def rows(self, kept: npt.NDArray[np.bool_]) -> Table:

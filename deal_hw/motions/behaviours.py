@@ -46,9 +46,7 @@ class Behaviour(Protocol):
 
 def centre(description: RobotDescription) -> FloatArray:
     """Return the centre of signals and actions, (A,): the default pose; for motors zero effort."""
-    if description.actuation == "motor":
-        return np.zeros(len(description.actuated))
-    return np.array(description.default_position)[list(description.actuated_index)]
+    return description.held(np.array(description.default_position))
 
 
 def position_command(description: RobotDescription | PolicySpec, target: FloatArray) -> JointCommand:

@@ -22,7 +22,6 @@ from deal_hw.workflows.say import Say, silent
 if TYPE_CHECKING:
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.data.recording.reader import Episode
-    from deal_hw.data.table import Table
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
 
@@ -134,12 +133,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     if episodes:
         described = dict(episodes[0].description)
     problems = {
-        table.name: [
-            verdict_json(v)
-            for v in examine_recording(
-                table, facts, config.force, servo=_takes_positions(facts, table), say=say
-            )
-        ]
+        table.name: [verdict_json(v) for v in examine_recording(table, facts, config.force, say=say)]
         for table in checked
     }
     if robot is None and described is None and config.model is not None:
@@ -267,14 +261,6 @@ def _refuse_ignored(config: ImportSettings) -> None:
         raise ConfigurationError(
             "--policy needs the robot that it moved: add --robot robot.yaml or --model robot.xml"
         )
-
-
-def _takes_positions(facts: JointFacts | None, table: Table) -> bool:
-    """Return whether commands must be positions: without a model, or if any actuator takes positions."""
-    if facts is None:
-        return True
-    at = [facts.names.index(name) for name in table.actuated]
-    return bool(at) and bool(facts.servo[at].any() or not facts.motor[at].any())
 
 
 def export_recordings(config: ExportSettings, say: Say = silent) -> tuple[int, str]:

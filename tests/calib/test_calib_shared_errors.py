@@ -92,25 +92,25 @@ def test_a_change_undone_is_the_recording(change: ChannelChange, efforts: bool) 
         # Efforts take the sign only, which is its own inverse.
         change = dataclasses.replace(change, clock=1.0)
     recorded = episode()
-    changed = change.of(recorded, ACTUATED, efforts=efforts)
+    changed = change.of(recorded, ACTUATED, [not efforts] * len(ACTUATED))
     back = tuple(map(int, np.argsort(change.source)))
     scale = tuple(1 / change.scale[j] for j in back)
     inverse = ChannelChange(source=back, scale=scale, clock=1 / change.clock)
-    assert same(inverse.of(changed, ACTUATED, efforts=efforts), recorded)
+    assert same(inverse.of(changed, ACTUATED, [not efforts] * len(ACTUATED)), recorded)
 
 
 def test_a_change_takes_each_channel_of_a_joint_along() -> None:
     """The joint without a motor has no command; a slower clock makes velocities smaller."""
     recorded = episode()
     change = ChannelChange(source=(1, 0, 2, 3), scale=(1.0, 1.0, -1.0, 2.0), clock=2.0)
-    found = change.of(recorded, ACTUATED, efforts=False)
+    found = change.of(recorded, ACTUATED, [True] * len(ACTUATED))
     assert np.array_equal(found.position[:, 0], recorded.position[:, 1])
     assert np.array_equal(found.target[:, 0], recorded.target[:, 1])
     assert np.array_equal(found.position[:, 2], -recorded.position[:, 2])
     assert np.array_equal(found.target[:, 2], 2 * recorded.target[:, 2])
     assert np.array_equal(found.velocity[:, 3], recorded.velocity[:, 3])
     assert found.step_s == 0.01
-    efforts = change.of(recorded, ACTUATED, efforts=True)
+    efforts = change.of(recorded, ACTUATED, [False] * len(ACTUATED))
     assert np.array_equal(efforts.target[:, 2], recorded.target[:, 2])
 
 

@@ -51,9 +51,6 @@ ARM = """
   </actuator>
 </mujoco>
 """
-VELOCITY_ARM = ARM.replace(
-    '<position name="servo" joint="elbow" kp="12" kv="0.1"/>', '<velocity name="servo" joint="elbow" kv="2"/>'
-)
 MODEL = "calibrate --model arm.xml --out o --data"
 OTHERS = "`deal-hw calibrate dataset` has no such option;"
 FILES = "`calibrate --model robot.xml`"
@@ -71,7 +68,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a model, recordings, a dataset, and files that are not what their names say."""
     folder = tmp_path_factory.mktemp("place")
     (folder / "arm.xml").write_text(ARM)
-    (folder / "velocity.xml").write_text(VELOCITY_ARM)
     (folder / "text.txt").write_text("hello\n")
     (folder / "empty.json").write_text("{}")
     (folder / "folder").mkdir()
@@ -189,7 +185,6 @@ SETTINGS: Lines = [
     (f"{MODEL} one.csv", "actuators of the model without recorded commands: belt"),
     (f"{MODEL} positions.csv", "name them as `target` in the column map"),
     (f"{MODEL} still.csv --force", "record more motion"),
-    ("calibrate --model velocity.xml --data rec.csv", "some are motors (elbow); calibration takes one kind"),
     ("collect cartpole --port p", "give --out RUN (the episodes go to RUN/dataset) or --dataset DIR"),
     ("collect cartpole --port p --out a --dataset b", "give --out RUN or --dataset DIR, not both"),
     ("collect cartpole --port p --out o --excite long.json", "an excitation of 1e+09 s"),

@@ -107,12 +107,13 @@ def test_physics_grid_fits_into_the_sampling_period(
     assert found.step_s == pytest.approx(period_s / steps)
 
 
-def test_motors_are_known_and_mixtures_refused(tmp_path: Path) -> None:
-    """Motors take efforts: the limit is the torque at a control of 1."""
+def test_motors_are_known_alone_and_beside_servos(tmp_path: Path) -> None:
+    """Motors take efforts: the limit is the torque at a control of 1; a servo keeps its own."""
     servo = '<position name="first" joint="lift" kp="10" kv="0.5" forcerange="-7 7"/>'
     motor = '<motor name="first" joint="lift" gear="30"/>'
-    with pytest.raises(ConfigurationError, match="some are motors"):
-        robot_of(tmp_path, ARM.replace(servo, motor))
+    mixed = robot_of(tmp_path, ARM.replace(servo, motor)).description
+    assert (mixed.actuation, mixed.motors, mixed.servos) == ("position", ("lift",), (False, True))
+    assert (mixed.stiffness, mixed.damping, mixed.effort_limit[0]) == ((0.0, 300.0), (0.0, 4.0), 30.0)
     other = '<position name="second" joint="rail" kp="300" kv="4"/>'
     text = ARM.replace(servo, motor).replace(other, '<motor name="second" joint="rail" gear="-2"/>')
     found = robot_of(tmp_path, text).description

@@ -120,7 +120,8 @@ class FollowingWatch:
             return np.array([table[unit] for unit in units])
 
         self._names, self._units = d.actuated, units
-        self._watched = d.actuation == "position"
+        # Beside motors, which follow no position, nothing is watched; no bus drives such a robot.
+        self._watched = all(d.servos)
         limit = np.array(d.effort_limit, dtype=float)
         self._limited = np.isfinite(limit)
         self._limit = np.where(self._limited, limit, 0.0)

@@ -23,7 +23,7 @@ within their delay and one period (tests/control/test_control_centring.py)."""
 
 
 class Centring:
-    """The feedback of one robot; zero for a robot with servos and for joints without limits.
+    """The feedback of one robot; zero for servos and for joints without limits.
 
     Args:
         description: The robot.
@@ -33,10 +33,10 @@ class Centring:
         self._joints = list(description.actuated_index)
         A = len(self._joints)
         self._around, self._spring, self._damper = np.zeros(A), np.zeros(A), np.zeros(A)
-        if description.actuation != "motor":
-            return
         limits = description.limits
         for a, j in enumerate(self._joints):
+            if description.servos[a]:
+                continue
             (low, high), fastest = limits.trip_position[j], 0.5 * limits.trip_velocity[j]
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
             if np.isfinite(half):

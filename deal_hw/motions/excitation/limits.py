@@ -87,9 +87,9 @@ def fit_to_limits(description: RobotDescription, offsets: FloatArray, *, smooth:
     ]
     if smooth and description.actuation == "position":
         trip = np.array(limits.trip_velocity)[list(description.actuated_index)]
-        pairs.append((step * description.control_rate_hz, 0.5 * trip))
+        pairs.append((step * description.control_rate_hz, np.where(description.servos, 0.5 * trip, np.inf)))
         effort = np.max(np.abs(predicted_effort(description, offsets)), axis=0)
-        pairs.append((effort, np.array(limits.effort)))
+        pairs.append((effort, np.where(description.servos, limits.effort, np.inf)))
     scale = np.ones(offsets.shape[1])
     for found, most in pairs:
         over = (found > most) & np.isfinite(most)

@@ -165,6 +165,7 @@ class ServoBatch:
         self._scaled = bool(np.any(self._per_ctrl != 1.0))
         self._ratio = np.array([1.0 if drive is None else drive.ratio for drive in robot.drives])
         self._gear = robot.model.actuator_gear[list(robot.actuator), 0]
+        self._servos = np.array(robot.description.servos, dtype=bool)
         self._default = {
             "servo_stiffness": np.array(description.stiffness),
             "servo_damping": np.array(description.damping),
@@ -260,7 +261,7 @@ class ServoBatch:
 
     def set_sent(self, stiffness: FloatArray, damping: FloatArray, effort_limit: FloatArray) -> None:
         """Set the gains and limits that the host sends from now on, (A,) each; without effect on motors."""
-        if self.robot.description.actuation != "position":
+        if not self._servos.any():
             return
         if self._steps is not None:
             self._steps.restore_sent()
@@ -274,11 +275,12 @@ class ServoBatch:
         limit = self._act("servo_effort_limit", effort_limit)
         actuator = np.array(self.robot.actuator)
         # The model's numbers are those before the gear, and a scaled set-point stays scaled.
-        kp, kd = kp / self._gear**2, kd / self._gear**2
-        gain[:, actuator, 0] = kp * self._ratio
-        bias[:, actuator, 1] = -kp
-        bias[:, actuator, 2] = -kd
-        limited = np.isfinite(limit).all(axis=0)
+        on, gear = self._servos, self._gear[self._servos]
+        kp, kd = kp[:, on] / gear**2, kd[:, on] / gear**2
+        gain[:, actuator[on], 0] = kp * self._ratio[on]
+        bias[:, actuator[on], 1] = -kp
+        bias[:, actuator[on], 2] = -kd
+        limited = on & np.isfinite(limit).all(axis=0)
         limit = limit / np.abs(self._gear)
         force[:, actuator[limited], 0] = -limit[:, limited]
         force[:, actuator[limited], 1] = limit[:, limited]
@@ -476,13 +478,13 @@ class ServoBatch:
 
     def _control(self, setpoint: FloatArray, force: FloatArray | None) -> tuple[FloatArray, int]:
         """Return what the engine sets at each step, (N, G, S, U), and the components of the state it is."""
-        if self.robot.description.actuation == "position":
+        if self._servos.any():
             # The servo compares the set-point with the reading.
             actuated = list(self.robot.description.actuated_index)
             if self._biased:
-                setpoint = setpoint - self._bias[:, None, None, actuated]
+                setpoint = setpoint - np.where(self._servos, self._bias[:, None, None, actuated], 0.0)
             if self._scale is not None:
-                setpoint = setpoint / self._scale[:, None, None, actuated]
+                setpoint = setpoint / np.where(self._servos, self._scale[:, None, None, actuated], 1.0)
             if self._scaled:
                 setpoint = setpoint / self._per_ctrl
         nu, actuator = self.robot.model.nu, list(self.robot.actuator)

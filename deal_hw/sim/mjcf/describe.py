@@ -88,8 +88,8 @@ def describe(
         rates: Sampling of the recordings.
 
     Raises:
-        ConfigurationError: A joint or actuator of the model was not recorded, an actuator is of an unknown
-            kind, or servos and motors are mixed.
+        ConfigurationError: A joint or actuator of the model was not recorded, or an actuator is of an unknown
+            kind.
         UnknownNameError: The model lacks a joint.
     """
     index = [element_id(model, "joint", name) for name in joints]
@@ -98,13 +98,7 @@ def describe(
     _check_actuators(model, actuators, actuated)
     # Without actuators there is nothing to command, as with motors that are off.
     drives = [_drive(model, i, name) for i, name in zip(actuators, actuated, strict=True)]
-    servo = any(drive.takes == "position" for drive in drives)
-    others = [name for name, drive in zip(actuated, drives, strict=True) if drive.takes != "position"]
-    if servo and others:
-        raise ConfigurationError(
-            f"some actuators of the model are position servos, some are motors ({', '.join(others)}); "
-            "calibration takes one kind"
-        )
+    servos = [drive.takes == "position" for drive in drives]
     return RobotDescription(
         name=mjcf.stem,
         joint_names=tuple(joints),
@@ -112,9 +106,11 @@ def describe(
         position_units=tuple("m" if model.jnt_type[j] == SLIDE else "rad" for j in index),
         default_position=tuple(float(model.qpos0[model.jnt_qposadr[j]]) for j in index),
         stiffness=tuple(drive.stiffness for drive in drives),
-        damping=tuple(drive.damping if servo else 0.0 for drive in drives),
+        damping=tuple(d.damping if servo else 0.0 for d, servo in zip(drives, servos, strict=True)),
         # A motor has its effort at a control of 1.
-        effort_limit=tuple(drive.effort_limit if servo else abs(drive.gain) for drive in drives),
+        effort_limit=tuple(
+            d.effort_limit if servo else abs(d.gain) for d, servo in zip(drives, servos, strict=True)
+        ),
         speed_limit=(math.inf,) * len(actuated),
         control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
         device_rate_hz=1.0 / rates.step_s,
@@ -124,7 +120,8 @@ def describe(
             noise=(0.0,) * len(joints), resolution=(0.0,) * len(joints), velocity_window_s=0.0
         ),
         mjcf=mjcf,
-        actuation="position" if servo else "motor",
+        actuation="position" if any(servos) else "motor",
+        motors=tuple(name for name, servo in zip(actuated, servos, strict=True) if any(servos) and not servo),
         floating_base=free,
         sources={
             "joint_names": "the recording's column map",

@@ -55,6 +55,11 @@ class JointFacts:
     speed_gain: FloatArray
     followers: frozenset[str] = frozenset()
 
+    @property
+    def motors(self) -> frozenset[str]:
+        """Joints whose actuator takes efforts or speeds, and none takes positions."""
+        return frozenset(name for name, on in zip(self.names, self.motor & ~self.servo, strict=True) if on)
+
 
 def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
     """Read the joints of a model.

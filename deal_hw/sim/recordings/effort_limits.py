@@ -21,10 +21,8 @@ def drives_at_limit(robot: RobotModel, episodes: Iterable[SampledEpisode]) -> tu
     asks = []
     for e in episodes:
         rows = np.minimum(e.sample, len(e.target) - 1)
-        if robot.description.actuation == "motor":
-            asks.append(gain * np.abs(e.target[rows]) > limit)
-            continue
         error = np.abs(e.target[rows] - e.position[:, robot.joints][:, joints])
-        asks.append(e.stiffness[rows] * error > e.effort_limit[rows])
+        servo = e.stiffness[rows] * error > e.effort_limit[rows]
+        asks.append(np.where(robot.description.servos, servo, gain * np.abs(e.target[rows]) > limit))
     share = np.mean(np.concatenate(asks), axis=0)
     return tuple(name for name, each in zip(robot.actuator_names, share, strict=True) if each > AT_LIMIT)

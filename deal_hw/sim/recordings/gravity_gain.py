@@ -41,14 +41,14 @@ class GravityGain:
 
 
 def gravity_gain(robot: RobotModel, episodes: list[SampledEpisode]) -> GravityGain | None:
-    """Estimate static gains from the joints' deviations; None for motors and floating bases.
+    """Estimate static gains from the joints' deviations; None for motors alone and floating bases.
 
     Args:
         robot: The nominal model, whose masses and geometry are assumed right.
         episodes: Recordings.
     """
     description = robot.description
-    if description.actuation != "position" or robot.base is not None:
+    if not any(description.servos) or robot.base is not None:
         return None
     model, data = robot.model, mujoco.MjData(robot.model)
     index = list(description.actuated_index)

@@ -128,8 +128,7 @@ def _settle(robot: RobotModel, batch: ServoBatch, start: FloatArray | None, seco
     joints = np.array(description.default_position if start is None else start, dtype=float)
     position = np.concatenate([batch.position[0][: robot.joints.start], joints])
     batch.set_state(position, np.zeros_like(position))
-    servo = description.actuation == "position"
-    rest = joints[list(description.actuated_index)] if servo else np.zeros(len(description.actuated))
+    rest = description.held(joints)
     if seconds > 0:
         batch.advance(np.repeat(rest[None, None], round(seconds / robot.step_s), axis=1))
     return rest

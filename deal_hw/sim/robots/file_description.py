@@ -8,7 +8,7 @@ from typing import Final
 
 from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
 from deal_hw.errors import ConfigurationError
-from deal_hw.sim.robots.robot_file import JointEntry, RobotFile
+from deal_hw.sim.robots.robot_file import ActuatorEntry, JointEntry, RobotFile
 
 OVERSHOOT: Final = 0.25
 """Share of the range by which a measured position may exceed it before a run trips."""
@@ -41,14 +41,19 @@ def limits_of(file: RobotFile, control_rate_hz: float) -> SafetyLimits:
     joints = file.joints
     driven = [(joint, joint.actuator) for joint in joints if joint.actuator is not None]
     free = (math.inf,) * len(driven)
-    motor, hardware = file.actuation == "motor", file.hardware is not None
+    hardware = file.hardware is not None
     share = TARGET_SHARE if hardware else 1.0
     age_s = max(LEAST_AGE_S, AGE_PERIODS / control_rate_hz)
     return SafetyLimits(
-        target=tuple((-1.0, 1.0) if motor else _range(joint) for joint, _ in driven),
-        target_step=free
-        if motor
-        else tuple(share * free_of(joint.velocity_limit) / control_rate_hz for joint, _ in driven),
+        target=tuple(
+            (-1.0, 1.0) if takes_effort(file, actuator) else _range(joint) for joint, actuator in driven
+        ),
+        target_step=tuple(
+            math.inf
+            if takes_effort(file, actuator)
+            else share * free_of(joint.velocity_limit) / control_rate_hz
+            for joint, actuator in driven
+        ),
         target_distance=free,
         trip_position=tuple(_trip_range(joint) for joint in joints),
         trip_velocity=tuple(free_of(joint.velocity_limit) for joint in joints),
@@ -61,6 +66,14 @@ def limits_of(file: RobotFile, control_rate_hz: float) -> SafetyLimits:
         ease_in_s=EASE_IN_S if hardware else 0.0,
         may_be_blocked=tuple(joint.name for joint, _ in driven if joint.may_be_blocked),
     )
+
+
+def takes_effort(file: RobotFile, actuator: ActuatorEntry) -> bool:
+    """Return whether a drive of a robot.yaml takes efforts: beside servos, one without stiffness does.
+
+    On a bus all drives take positions, also where their stiffness is not known.
+    """
+    return file.actuation == "motor" or (file.hardware is None and actuator.stiffness == 0.0)
 
 
 def file_description(file: RobotFile, mjcf: Path) -> RobotDescription:

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from deal_hw.sim.engine.compiling import DIVERGED
-from deal_hw.sim.engine.model import command_scale
+from deal_hw.sim.engine.model import actuator_of, command_scale
 from deal_hw.sim.robots.user_robot import UserRobot
 from deal_hw.types import FloatArray
 
@@ -52,11 +52,11 @@ def hold(robot: UserRobot) -> Holding:
     for name, position in zip(description.joint_names, description.default_position, strict=True):
         data.qpos[model.joint(name).qposadr[0]] = position
     start = np.array([description.default_position[i] for i in description.actuated_index])
-    if description.actuation == "position":
-        scale = command_scale(model, range(model.nu))
-        for actuator in range(model.nu):
-            joint = model.joint(int(model.actuator_trnid[actuator, 0])).name
-            data.ctrl[actuator] = start[description.actuated.index(joint)] / scale[actuator]
+    scale = command_scale(model, range(model.nu))
+    rest = description.held(np.array(description.default_position))
+    for name, held in zip(description.actuated, rest, strict=True):
+        actuator = actuator_of(model, name)
+        data.ctrl[actuator] = held / scale[actuator]
     at, moving = [int(j.qposadr[0]) for j in driven], [int(j.dofadr[0]) for j in driven]
     steps = max(round(SECONDS / model.opt.timestep), 4)
     speed = np.empty((steps, len(driven)))
@@ -70,7 +70,7 @@ def hold(robot: UserRobot) -> Holding:
         np.sqrt(np.mean(np.square(speed[a : a + quarter]), axis=0)) for a in (quarter, steps - quarter)
     )
     grows = (last > UNSTABLE_GROWTH * second) & (last > LEAST_SPEED)
-    grows &= description.actuation == "position"
+    grows &= np.array(description.servos, dtype=bool)
     return Holding(
         seconds=steps * float(model.opt.timestep),
         diverged=diverged,

@@ -38,7 +38,8 @@ class ActuatorEntry:
     """The actuator of a joint.
 
     Attributes:
-        stiffness: kp of a position servo [N·m/rad or N/m]; 0 for a motor.
+        stiffness: kp of a position servo [N·m/rad or N/m]; 0 for a motor. Without `hardware`, a joint with 0
+            takes efforts, also beside servos.
         damping: kd of a position servo [N·m·s/rad or N·s/m]; 0 for a motor.
         effort_limit: Largest effort [N·m or N]; None for no limit. For a motor, the effort at command 1.
     """

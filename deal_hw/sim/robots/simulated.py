@@ -189,9 +189,7 @@ class SimulatedRobot(Robot):
 
     def _rest(self) -> FloatArray:
         """Return the actuators' command before the first one: the start pose, or no effort."""
-        if self.description.actuation == "motor":
-            return np.zeros(len(self.description.actuated))
-        return np.array(self._home[list(self.description.actuated_index)])
+        return self.description.held(self._home)
 
     def _reset(self) -> None:
         d = self.description

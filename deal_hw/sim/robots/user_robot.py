@@ -136,7 +136,6 @@ def derive_robot(
     period_s = 1.0 / (state_rate_hz or control_rate_hz)
     rates = sampling(period_s, float(model.opt.timestep), period_s * WINDOW_TICKS)
     base = describe(mjcf, model, read, driven, rates)
-    servo = base.actuation == "position"
     joints = []
     for position, joint in zip(base.default_position, read, strict=True):
         j = facts.names.index(joint)
@@ -150,7 +149,7 @@ def derive_robot(
                 damping=base.damping[a] + 0.0,
                 effort_limit=_finite(base.effort_limit[a]),
             )
-            if servo:
+            if facts.servo[j]:
                 low, high = max(low, facts.command[j, 0]), min(high, facts.command[j, 1])
         ranged = math.isfinite(low) and math.isfinite(high)
         with reading(f"model {mjcf}, joint {joint}", "a joint of a robot", error=ConfigurationError):
@@ -166,7 +165,7 @@ def derive_robot(
         version=1,
         name=name or mjcf.stem,
         mjcf=mjcf_entry or mjcf.name,
-        actuation="position" if servo else "motor",
+        actuation="motor" if base.actuation == "motor" else "position",
         floating_base=base.floating_base,
         feet=tuple(feet),
         control_rate_hz=control_rate_hz,
@@ -212,6 +211,11 @@ def contradictions(robot: UserRobot) -> Iterator[str]:
     ):
         if given != own:
             yield f"{what} is {shown(given)}; write {'null' if own is None else own}, as the MJCF has it"
+    if file.hardware is not None and base.motors:
+        yield (
+            f"{', '.join(base.motors)} take efforts in the MJCF, and `hardware` commands positions; give "
+            "them a <position> each"
+        )
     yield from _of_joints(robot, base, facts.limits[[facts.names.index(n) for n in robot.joint_names]])
     geoms = element_names(model, "geom")
     spheres = [name for i, name in enumerate(geoms) if name and model.geom_type[i] == _SPHERE]

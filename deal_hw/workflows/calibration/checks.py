@@ -102,7 +102,6 @@ def examine_recording(
     facts: JointFacts | None,
     force: bool,
     *,
-    servo: bool = True,
     kept: Table | None = None,
     spikes: SpikeSettings = DEFAULT_SPIKES,
     blind: Sequence[BlindRange] | None = None,
@@ -114,7 +113,6 @@ def examine_recording(
         table: The recording.
         facts: The model's joints, for their limits; None without a model.
         force: Continue although a check failed.
-        servo: Commands are positions; efforts are not compared with positions.
         kept: The recording without the left-out parts; None: all of it is used.
         spikes: Definition of a spike.
         blind: Blind ranges of the robot's sensors; None: those that this recording shows.
@@ -128,16 +126,22 @@ def examine_recording(
     from deal_hw.errors import DatasetError
     from deal_hw.findings import Severity
 
-    limits = None
+    limits, motors = None, frozenset[str]()
     if facts is not None:
         limits = facts.limits[[facts.names.index(name) for name in table.joint_names]]
-    every = list(examine(table, limits, kept, spikes, efforts=not servo, blind=blind))
+        motors = facts.motors
+    # Efforts are not compared with positions.
+    servos = [name for name in table.actuated if name not in motors]
+    compared, kept = (one and one.commanded(servos or one.actuated) for one in (table, kept))
+    every = list(examine(compared, limits, kept, spikes, efforts=bool(motors), blind=blind))
     if facts is not None and {v.code for v in every} >= {"assignment"}:
         # These checks run only if clock and values are valid.
-        command = facts.command[[facts.names.index(name) for name in table.actuated]]
-        every.append(command_kind(table, servo=servo, limits=command))
+        for names, servo in ((servos, True), (motors, False)):
+            part = table.commanded(names)
+            command = facts.command[[facts.names.index(name) for name in part.actuated]]
+            every += [command_kind(part, servo=servo, limits=command)] if part.actuated else []
     found = [v for v in every if v.severity is not Severity.OK]
-    if not servo:
+    if not servos:
         found = [v for v in found if v.code in MOTOR_CHECKS]
     for verdict in found:
         # The error itself contains the failed ones.
@@ -168,6 +172,8 @@ def warn_of_gravity(
     names = robot.actuator_names
     friction = robot.model.dof_frictionloss[list(robot.qvel)][list(robot.description.actuated_index)]
     for a, joint in enumerate(robot.description.actuated):
+        if not robot.description.servos[a]:
+            continue
         if found.explained[a] < GRAVITY_EXPLAINED or found.deviation[a] < GRAVITY_LEAST:
             continue
         # Dry friction holds such a load anywhere: the deviation is that of the motion.

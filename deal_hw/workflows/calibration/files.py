@@ -80,10 +80,9 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
     parts = without(
         settings.leave_out, *([without_blind(table, blind) for table in tables] for tables in smooth)
     )
-    servo = description.actuation == "position"
     verdicts = {
         table.name: examine_recording(
-            table, facts, settings.force, servo=servo, kept=kept, spikes=spikes, blind=blind, say=say
+            table, facts, settings.force, kept=kept, spikes=spikes, blind=blind, say=say
         )
         for table, kept in zip((*fitted, *held), itertools.chain(*parts), strict=True)
     }

@@ -208,8 +208,9 @@ def on_grid(table: Table, robot: RobotModel, rates: Sampling) -> list[Recording]
         effort_limit=description.effort_limit,
         speed_limit=description.speed_limit,
     )
-    if description.actuation == "motor":
+    if not all(description.servos):
         model, actuators = robot.model, list(robot.actuator)
         full = model.actuator_gear[actuators, 0] * model.actuator_gainprm[actuators, 0]
-        table = dataclasses.replace(table, target=table.target / full)
+        target = table.target / np.where(description.servos, 1.0, full)
+        table = dataclasses.replace(table, target=target)
     return to_trajectories(table, gains, rates.period_s)
