@@ -350,6 +350,8 @@ def _joint_facts(model: Path | None, say: Say) -> JointFacts | None:
             f"{model.name}: joints with several coordinates are not read from recordings: "
             f"{', '.join(facts.left_out)}"
         )
+    for note in facts.notes:
+        say(f"{model.name}: {note}")
     return facts
 
 

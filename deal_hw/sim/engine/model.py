@@ -84,6 +84,12 @@ class RobotModel:
             qvel[..., list(self.qvel)] = velocity
         for follower in self.followers:
             follower.follow(self.model, qpos, qvel)
+        # A ball joint has no reading: it begins at rest in the model's pose.
+        for ball in np.flatnonzero(self.model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)):
+            at, dof = int(self.model.jnt_qposadr[ball]), int(self.model.jnt_dofadr[ball])
+            qpos[..., at : at + 4] = self.model.qpos0[at : at + 4]
+            if qvel is not None:
+                qvel[..., dof : dof + 3] = 0.0
 
     @property
     def actuator_names(self) -> tuple[str, ...]:

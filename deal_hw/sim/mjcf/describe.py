@@ -15,6 +15,7 @@ from deal_hw.description import RobotDescription, SafetyLimits, SensorModel
 from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import actuator_of
+from deal_hw.sim.mjcf.notes import BODY, passive_balls
 from deal_hw.sim.parameters.drive import JointDrive, drive_of
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.followers import followers_of
@@ -152,19 +153,21 @@ def with_speed_limits(description: RobotDescription, model: Any, space: Paramete
 def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
     """Check that every joint was recorded or follows such; return the base's free joint, if any."""
     free: str | None = None
-    missing = []
-    led = {follower.joint for follower in followers_of(model, recorded)}
+    missing, several = list[str](), list[str]()
+    led = {follower.joint for follower in followers_of(model, recorded)} | set(passive_balls(model))
     for index in range(model.njnt):
         name = model.joint(index).name
         if model.jnt_type[index] == _FREE and free is None and name:
             free = name
         elif index not in recorded and index not in led:
-            word = (
-                ""
-                if model.jnt_type[index] in (HINGE, SLIDE)
-                else " (ball, or a second or unnamed free joint)"
-            )
-            missing.append((name or f"joint {index}") + word)
+            single = model.jnt_type[index] in (HINGE, SLIDE)
+            (missing if single else several).append(name or f"joint {index}")
+    if several:
+        raise ConfigurationError(
+            f"joints of the model with several coordinates, which no recording has: {', '.join(several)} (a "
+            "driven ball joint, or a second or unnamed free joint); remove <joint> or <freejoint> there in a "
+            "copy of the MJCF, or write three hinges"
+        )
     if missing:
         raise ConfigurationError(
             f"joints of the model without a recorded position: {', '.join(missing)}; add them to the column "
@@ -174,12 +177,13 @@ def _check_joints(model: Any, recorded: Sequence[int]) -> str | None:
 
 
 def _check_actuators(model: Any, actuators: Sequence[int], actuated: Sequence[str]) -> None:
-    used = {*actuators, *brakes(model)}
+    held = {i for i in range(model.nu) if model.actuator_trntype[i] == BODY}
+    used = {*actuators, *brakes(model), *held}
     idle = [model.actuator(i).name or f"number {i}" for i in range(model.nu) if i not in used]
     apart = [
         f"{model.actuator(i).name or f'number {i}'} (a {DRIVEN.get(int(model.actuator_trntype[i]), 'body')})"
         for i in range(model.nu)
-        if i not in actuators and joint_of(model, i) < 0
+        if i not in used and joint_of(model, i) < 0
     ]
     if apart:
         raise ConfigurationError(

@@ -12,6 +12,7 @@ import numpy as np
 
 from deal_hw.errors import ConfigurationError
 from deal_hw.sim.engine.compiling import compile_mjcf
+from deal_hw.sim.mjcf.notes import model_notes
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.followers import natural_followers
 from deal_hw.sim.parameters.kind import joint_of
@@ -41,6 +42,7 @@ class JointFacts:
         speed_gain: Effort an error of the speed of each joint whose actuator takes speeds, (J,)
             [N·m·s/rad or N·s/m]; NaN for others. Recordings hold efforts, this times the speed.
         followers: Joints that need no reading, as an equality of the model moves them with others.
+        notes: What of the model has no effect in a calibration, as sentences.
     """
 
     names: tuple[str, ...]
@@ -54,11 +56,13 @@ class JointFacts:
     gain: FloatArray
     speed_gain: FloatArray
     followers: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = ()
 
     @property
     def motors(self) -> frozenset[str]:
-        """Joints whose actuator takes efforts or speeds, and none takes positions."""
-        return frozenset(name for name, on in zip(self.names, self.motor & ~self.servo, strict=True) if on)
+        """Joints whose actuator takes efforts or speeds; what an unknown actuator takes, nobody knows."""
+        known = self.motor & ~self.servo & np.isfinite(self.full_effort)
+        return frozenset(name for name, on in zip(self.names, known, strict=True) if on)
 
 
 def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
@@ -98,6 +102,7 @@ def joint_facts(mjcf: Path, model: mujoco.MjModel | None = None) -> JointFacts:
         tuple(left_out),
         *_actuation(model, index_of),
         frozenset(model.joint(follower.joint).name for follower in natural_followers(model)),
+        tuple(model_notes(model)),
     )
 
 

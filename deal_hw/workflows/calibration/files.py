@@ -59,6 +59,8 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
     model = compile_mjcf(path)
     space = searched_space(settings, model, say)
     facts = joint_facts(path, model)
+    for note in facts.notes:
+        say(f"{path.name}: {note}")
     policy = None
     if settings.policy is not None:
         from deal_hw.policies.onnx_runtime import OnnxPolicy
