@@ -30,6 +30,7 @@ def derived_robot(model: Path, name: str, tables: Sequence[Table]) -> UserRobot 
         ConfigurationError: `inspect` and `calibrate` could not use it.
     """
     from deal_hw.data.importing.grid import common_period
+    from deal_hw.sim.mjcf.urdf import require_drives
     from deal_hw.sim.robots.user_robot import derive_robot
 
     if is_ours(name or model.stem):
@@ -39,6 +40,7 @@ def derived_robot(model: Path, name: str, tables: Sequence[Table]) -> UserRobot 
         read = {joint for table in tables for joint in table.joint_names}
         robot = derive_robot(model, name=name, control_rate_hz=rate_hz, several_trees=True, recorded=read)
         for table in tables:
+            require_drives(model, robot.model, table.actuated)
             _check_joints(robot, table)
     except ConfigurationError as err:
         err.args = (

@@ -16,6 +16,7 @@ from deal_hw.errors import ConfigurationError
 from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.model import actuator_of
 from deal_hw.sim.mjcf.notes import BODY, passive_balls
+from deal_hw.sim.mjcf.urdf import require_drives
 from deal_hw.sim.parameters.drive import JointDrive, drive_of
 from deal_hw.sim.parameters.fields import element_id, element_names
 from deal_hw.sim.parameters.followers import followers_of
@@ -94,6 +95,7 @@ def describe(
         UnknownNameError: The model lacks a joint.
     """
     index = [element_id(model, "joint", name) for name in joints]
+    require_drives(mjcf, model, actuated)
     free = _check_joints(model, index)
     actuators = [actuator_of(model, name) for name in actuated]
     _check_actuators(model, actuators, actuated)

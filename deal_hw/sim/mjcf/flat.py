@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ ROUNDED: Final = 1e-5
 """Relative difference between a file and what MuJoCo writes of it: it writes six digits."""
 
 
-def write_flat(path: Path, target: Path) -> None:
+def write_flat(path: Path, target: Path, change: Callable[[Any], None] | None = None) -> None:
     """Write a model as one file without ``<attach>``, ``<replicate>``, ``<composite>`` or ``<include>``.
 
     MuJoCo writes it: with six digits, without comments, and with actuators as ``<general>``.
@@ -24,6 +24,7 @@ def write_flat(path: Path, target: Path) -> None:
     Args:
         path: The model.
         target: The file to write; it names meshes and textures from its own folder.
+        change: Changes the MjSpec before.
 
     Raises:
         ConfigurationError: MuJoCo cannot write it.
@@ -31,6 +32,8 @@ def write_flat(path: Path, target: Path) -> None:
     whole = os.path.abspath(path)
     try:
         spec = mujoco.MjSpec.from_file(whole)
+        if change is not None:
+            change(spec)
         spec.compile()
         target.write_text(spec.to_xml(), encoding="utf-8")
     except (ValueError, mujoco.FatalError) as err:
@@ -53,12 +56,15 @@ def write_flat(path: Path, target: Path) -> None:
             element.set("texturedir", None)
         asset, kind = assets.get((element.tag, element.get("name") or ""), (None, ""))
         if asset is not None and element.get("file"):
-            element.set("file", _place(asset, kind, files, target.parent))
+            element.set("file", _place(asset, kind, files, os.path.dirname(whole), target.parent))
     target.write_bytes(top.render())
 
 
-def _place(asset: Any, kind: str, files: Sequence[str], folder: Path) -> str:
-    """Return the file of an asset, seen from a folder."""
+def _place(asset: Any, kind: str, files: Sequence[str], beside: str, folder: Path) -> str:
+    """Return the file of an asset, seen from a folder: one of the model's files, or one beside the model.
+
+    MuJoCo lists no files of a URDF.
+    """
     tail = os.path.normpath(os.path.join(getattr(asset.compiler, kind), asset.file))
     found = [name for name in files if name == tail or name.endswith(os.sep + tail)]
-    return os.path.relpath(found[0], os.path.abspath(folder)) if found else str(asset.file)
+    return os.path.relpath(found[0] if found else os.path.join(beside, tail), os.path.abspath(folder))

@@ -114,6 +114,8 @@ NEW_ROBOT = Kinds(
 def new_robot(settings: NewRobotSettings | NewFromLeRobotSettings | NewFromBusSettings) -> Path:
     """Write a robot.yaml from an MJCF, as ``deal-hw robot new``.
 
+    From a URDF, which holds no drives, it writes an MJCF with servos to start from first.
+
     :class:`NewRobotSettings` describes the arguments: ``new_robot("robot.xml", control_rate=100.0)``. With
     ``lerobot`` (:class:`NewFromLeRobotSettings`) or ``bus`` (:class:`NewFromBusSettings`) it has the arm's
     servos.
@@ -126,12 +128,18 @@ def new_robot(settings: NewRobotSettings | NewFromLeRobotSettings | NewFromBusSe
             or the servos are not those of this arm.
     """
     user_robot = user_robots()
+    from deal_hw.sim.mjcf import urdf
     from deal_hw.sim.robots.robot_file import FILE_NAME, write_robot_file
 
     model = Path(settings.model)
     out = model.parent / FILE_NAME if settings.out is None else Path(settings.out)
     if out.exists():
         raise ConfigurationError(f"{out} exists; name another file with --out, or remove it")
+    if urdf.is_urdf(model):
+        drives = out.parent / f"{model.stem}.xml"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        urdf.write_with_drives(model, drives)
+        model = drives
     robot = user_robot.derive_robot(
         model,
         name=settings.name,
