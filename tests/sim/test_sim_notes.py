@@ -105,9 +105,19 @@ def test_a_driven_ball_and_a_second_free_body_are_refused_with_what_to_do(tmp_pa
 
 
 def test_an_unknown_actuator_is_named_first(tmp_path: Path) -> None:
-    """A <dcmotor> is no reason to call recorded positions efforts."""
-    path = write(tmp_path, '<dcmotor name="p" joint="hub" motorconst="0.1" resistance="1"/>')
-    facts = joint_facts(path)
-    assert facts.motors == frozenset()
-    with pytest.raises(ConfigurationError, match="'p' is a <dcmotor>"):
+    """A <dcmotor> is no reason to call recorded positions efforts; what the message writes moves alike."""
+    path = write(tmp_path, '<dcmotor name="p" joint="hub" motorconst="0.3" resistance="2"/>')
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert joint_facts(path).motors == frozenset()
+    with pytest.raises(ConfigurationError, match="'p' is a <dcmotor>") as refused:
         robot(path)
+    instead = str(refused.value).partition("write <general ")[2].partition("/>")[0]
+    other = write(tmp_path, f'<general name="p" joint="hub" {instead}/>')
+    ends = []
+    for one in (model, mujoco.MjModel.from_xml_path(str(other))):
+        data = mujoco.MjData(one)
+        data.ctrl[0] = 5.0
+        mujoco.mj_step(one, data, 200)
+        ends.append(data.qpos[0])
+    assert ends[0] == pytest.approx(ends[1], abs=1e-9)
+    assert robot(other).description.motors == () and robot(other).description.actuation == "motor"

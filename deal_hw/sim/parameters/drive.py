@@ -26,6 +26,7 @@ from deal_hw.types import FloatArray
 Takes = Literal["position", "velocity", "effort"]
 
 _NO_FILTER = int(mujoco.mjtDyn.mjDYN_NONE)
+_DCMOTOR = int(mujoco.mjtDyn.mjDYN_DCMOTOR)
 _FILTER, _EXACT = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 _INSTEAD = {
     int(mujoco.mjtDyn.mjDYN_INTEGRATOR): (
@@ -34,9 +35,6 @@ _INSTEAD = {
     ),
     int(mujoco.mjtDyn.mjDYN_MUSCLE): (
         "is a <muscle>, whose force depends on its length; write a <position> or a <motor> for what drives it"
-    ),
-    int(mujoco.mjtDyn.mjDYN_DCMOTOR): (
-        "is a <dcmotor>; write <motor>, and search its damping and motor_free_speed"
     ),
     int(mujoco.mjtDyn.mjDYN_PID): (
         "is a <pid> with an integral part; write <position kp kv>, or <motor> and record its efforts"
@@ -151,6 +149,14 @@ def _problem(model: Any, actuator: int, effort: float, bias: FloatArray) -> str:
     if actuator in brakes(model):
         return "is the damping of the position servo beside it; search that one's servo_damping"
     dynamics = int(model.actuator_dyntype[actuator])
+    if dynamics == _DCMOTOR:
+        resistance, constant = model.actuator_gainprm[actuator, :2].tolist()
+        gain = constant / resistance
+        return (
+            f'is a <dcmotor>; write <general gainprm="{gain:.6g}" biastype="affine" biasprm="0 0 '
+            f'{-constant * gain:.6g}"/> instead, which is the same motor without inductance, cogging and '
+            "bristles, and search its motor_gain (K/R) and servo_damping (K²/R)"
+        )
     if dynamics not in (_NO_FILTER, _FILTER, _EXACT):
         return _INSTEAD.get(dynamics, f"has dyntype number {dynamics}; write a <position> or a <motor>")
     gaintype, biastype = (
