@@ -15,7 +15,7 @@ from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.mjcf.joint_facts import joint_facts
-from deal_hw.sim.parameters.template import default_space
+from deal_hw.sim.parameters.default_space import default_space
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
 
 ARM = """<mujoco>

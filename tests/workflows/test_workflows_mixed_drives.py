@@ -15,7 +15,7 @@ from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
 from deal_hw.sim.mjcf.describe import describe, sampling
 from deal_hw.sim.mjcf.exports import actuator_tables
-from deal_hw.sim.parameters.template import default_space
+from deal_hw.sim.parameters.default_space import default_space
 from deal_hw.sim.robots.user_robot import read_robot
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
