@@ -30,6 +30,7 @@ from deal_hw.sim.mjcf.plain import PLAIN_TEXT
 from deal_hw.sim.parameters import DEVICE_KINDS, KIND_TABLE
 from deal_hw.sim.parameters.drive import find_drive
 from deal_hw.sim.parameters.fields import ModelFields, element_id, element_names
+from deal_hw.sim.parameters.kind import joint_of
 from deal_hw.sim.parameters.one_drive import gather
 from deal_hw.sim.parameters.sensor import ENCODER_BIAS, ENCODER_SCALE
 from deal_hw.sim.parameters.transmission import TRANSMISSION_STIFFNESS
@@ -77,7 +78,8 @@ class ActuatorLaws:
         for kind, elements in values.items():
             for name, _ in elements:
                 element_id(model, KIND_TABLE[kind].element, name)
-        self._joint = [int(j) for j in model.actuator_trnid[:, 0]]
+        # What drives no joint is no servo: its -1 stands for none.
+        self._joint = [joint_of(model, actuator) for actuator in range(model.nu)]
         drives = [find_drive(model, i) for i in range(model.nu)]
         self._servo = np.array([d is not None and d.takes == "position" for d in drives], dtype=bool)
         self._per_ctrl = command_scale(model, range(model.nu))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from deal_hw.errors import ConfigurationError
+from deal_hw.sim.actuators import ActuatorLaws
 from deal_hw.sim.engine.batch import ServoBatch
 from deal_hw.sim.engine.compiling import compile_mjcf
 from deal_hw.sim.engine.model import RobotModel, load_model
@@ -87,13 +88,26 @@ def test_a_ball_joint_begins_at_rest_and_moves(tmp_path: Path) -> None:
     for _ in range(2):
         batch.set_state(np.array([0.3]), np.array([1.0]))
         found.append(batch.advance(np.full((1, 200, 1), -0.5), every=10)[0][0, :, 0])
-    assert np.array_equal(*found)
+    assert np.array_equal(found[0], found[1])
     model = mujoco.MjModel.from_xml_path(str(one.description.mjcf))
     data = mujoco.MjData(model)
     data.qpos[0], data.qvel[0], data.ctrl[0] = 0.3, 1.0, -0.5
     mujoco.mj_step(model, data, 200)
     assert abs(data.qpos[1]) < 0.999
     assert found[0][-1] == pytest.approx(data.qpos[0], abs=1e-9)
+
+
+def test_laws_act_beside_an_adhesion(tmp_path: Path) -> None:
+    """It drives body 1, and the model has one joint: the servo's laws act as without it."""
+    ends = []
+    for more in ("", ADHESION):
+        model = mujoco.MjModel.from_xml_path(str(write(tmp_path, more=more)))
+        data = mujoco.MjData(model)
+        laws = ActuatorLaws(model, data)
+        for _ in range(100):
+            laws.step(np.eye(model.nu)[0])
+        ends.append(data.qpos[0])
+    assert ends[0] == ends[1] > 0.1
 
 
 def test_a_driven_ball_and_a_second_free_body_are_refused_with_what_to_do(tmp_path: Path) -> None:

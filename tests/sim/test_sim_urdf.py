@@ -13,6 +13,7 @@ from deal_hw.sim.mjcf.urdf import is_urdf
 from deal_hw.sim.parameters.drive import drive_of
 from deal_hw.sim.robots.holding import hold
 from deal_hw.sim.robots.user_robot import read_robot
+from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
 from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.import_export import ImportSettings, import_recordings
@@ -46,11 +47,11 @@ def urdf(tmp_path: Path) -> Path:
     return path
 
 
-def rows(commands: bool) -> dict[str, np.ndarray]:
+def rows(commands: bool) -> dict[str, FloatArray]:
     """Return 4 s of two joints, with commands that they follow or without any."""
     time, rng = 0.01 * np.arange(400), np.random.default_rng(0)
     target = {"hip": 0.4 * np.sin(4 * time), "knee": 0.3 * np.sin(6 * time)}
-    found = {"time": time}
+    found: dict[str, FloatArray] = {"time": np.asarray(time, dtype=np.float64)}
     for name, values in target.items():
         found[f"{name}_pos"] = 0.97 * np.roll(values, 3) + 5e-4 * rng.standard_normal(400)
         found |= {f"{name}_cmd": values} if commands else {}
@@ -80,7 +81,8 @@ def test_robot_new_writes_servos_that_hold(urdf: Path, tmp_path: Path) -> None:
     assert mujoco.MjModel.from_xml_path(str(robot.mjcf)).nmesh == 1
     hip, knee = (drive_of(robot.model, i, "") for i in range(2))
     inertia = robot.model.dof_M0
-    assert (hip.stiffness, hip.effort_limit) == (pytest.approx(25), pytest.approx(5))
+    assert hip.stiffness == pytest.approx(25)
+    assert hip.effort_limit == pytest.approx(5)
     assert knee.stiffness == pytest.approx(inertia[1] * (10 * np.pi) ** 2, rel=1e-4)
     assert hip.damping == pytest.approx(2 * np.sqrt(hip.stiffness * inertia[0]), rel=1e-4)
     held = hold(robot)

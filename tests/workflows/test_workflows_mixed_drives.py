@@ -73,7 +73,7 @@ def record(kind: str, seed: int) -> dict[str, FloatArray]:
     seen = play(mujoco.MjModel.from_xml_string(text(kind, **TRUE)), control, 5)
     seen += 5e-4 * rng.standard_normal(seen.shape)
     unit = OWN["gain"] if kind == "motor" else 1.0
-    time = 0.01 * np.arange(len(seen))
+    time: FloatArray = 0.01 * np.arange(len(seen), dtype=np.float64)
     return {
         "time": time,
         "hip_pos": seen[:, 0],

@@ -132,7 +132,8 @@ def examine_recording(
         motors = facts.motors
     # Efforts are not compared with positions.
     servos = [name for name in table.actuated if name not in motors]
-    compared, kept = (one and one.commanded(servos or one.actuated) for one in (table, kept))
+    compared = table.commanded(servos or table.actuated)
+    kept = None if kept is None else kept.commanded(compared.actuated)
     every = list(examine(compared, limits, kept, spikes, efforts=bool(motors), blind=blind))
     if facts is not None and {v.code for v in every} >= {"assignment"}:
         # These checks run only if clock and values are valid.
