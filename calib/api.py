@@ -9,7 +9,8 @@ of its own takes the pieces: docs/how-to/own-calibration-engine.md does so with 
 from __future__ import annotations
 
 from deal_hw.calib.data.parts import longest_windows, part_of, samples_in
-from deal_hw.calib.data.problem import Member, MemberPrediction, Problem, WindowData
+from deal_hw.calib.data.problem import Member, Problem
+from deal_hw.calib.data.window_data import MemberPrediction, WindowData
 from deal_hw.calib.fit.intervals import Uncertainty, uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.null_space import NullSpace, null_space
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error

@@ -17,8 +17,8 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members
 from deal_hw.calib.data.parts import taken
-from deal_hw.calib.data.problem import WindowData
 from deal_hw.calib.data.search import Search, SearchLog, Stepper
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.residual import (
     LATENCY_STEP_S,

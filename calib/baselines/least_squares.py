@@ -25,9 +25,10 @@ from scipy.optimize import least_squares
 
 from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.innovations import Members, explained, samples_per_tick
-from deal_hw.calib.data.problem import Member, Problem, WindowData
+from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.data.resume import State
 from deal_hw.calib.data.search import Search, SearchLog, Stepper
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.intervals import intervals
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
 from deal_hw.calib.fit.residual import PARAMETER_STEP

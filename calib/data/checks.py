@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from deal_hw.calib.data.parts import longest_windows, taken
-from deal_hw.calib.data.problem import Problem, WindowData
-from deal_hw.data.recording.excitation import FEWEST_CHANGES, LEAST_MOTION, SHORTEST_S
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
+from deal_hw.data.checks.samples import SHORTEST_PART_S
+from deal_hw.data.recording.excitation import FEWEST_CHANGES, LEAST_MOTION
 from deal_hw.errors import ConfigurationError, InsufficientDataError
 from deal_hw.sim.engine.batch import COMMAND_DELAY
 from deal_hw.sim.recordings.episode import SampledEpisode
@@ -43,9 +45,9 @@ def check_excitation(problem: Problem) -> None:
     """
     seconds = sum(float(np.sum(e.usable)) * e.period_s for e in problem.episodes)
     advice = "record again with `deal-hw collect --motion rich` (4 s; --excitation-level 1 to 3 is stronger)"
-    if seconds < SHORTEST_S:
+    if seconds < SHORTEST_PART_S:
         raise InsufficientDataError(
-            f"{seconds:.2f} s of usable samples, at least {SHORTEST_S:g} s are needed; {advice}"
+            f"{seconds:.2f} s of usable samples, at least {SHORTEST_PART_S:g} s are needed; {advice}"
         )
     names = problem.robot.description.joint_names
     joints = problem.robot.joints

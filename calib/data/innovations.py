@@ -17,7 +17,8 @@ import numpy as np
 from deal_hw.calib.data.independent import in_order
 from deal_hw.calib.data.noise import NOISE_FREE_STD
 from deal_hw.calib.data.parts import measurements
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.sim.engine.batch import ServoBatch, default_threads
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints
@@ -57,9 +58,9 @@ def cut(problem: Problem, ticks: int) -> list[WindowData]:
     """
     per_tick = samples_per_tick(problem)
     if not is_noisy(problem):
-        return problem.windows(ticks * per_tick)
+        return problem.windows(ticks * per_tick, shorter=False)
     margin = round(0.5 * problem.smoothing_s * problem.robot.description.state_rate_hz)
-    return problem.windows(ticks * per_tick, offset=margin)
+    return problem.windows(ticks * per_tick, offset=margin, shorter=False)
 
 
 def early_setpoints(

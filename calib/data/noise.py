@@ -289,14 +289,21 @@ def _slope(x: FloatArray, y: FloatArray, sigma: FloatArray) -> tuple[float, floa
     return float(np.sum(w * (x - mean_x) * (y - mean_y)) / spread), 1.0 / math.sqrt(spread)
 
 
+def alike(values: Sequence[float]) -> list[IntArray]:
+    """Return the rows of each distinct value, such as the episodes of each sampling period."""
+    every = np.array(values)
+    return [np.flatnonzero(every == value) for value in dict.fromkeys(every.tolist())]
+
+
 def autocorrelations(residuals: Sequence[FloatArray], longest: int) -> Iterator[tuple[float, int]]:
     """Yield the autocorrelation of residuals, (W, H, ...) per episode, at lags 1, 2, ..., and its pairs.
 
+    The episodes have one rate; some windows may be shorter.
     A missing sample has a residual of exactly 0, and does not count. Lags end at ``longest`` samples.
     """
     count = max(sum(map(np.count_nonzero, residuals)), 1)
     power = max(sum(float(np.sum(r**2)) for r in residuals) / count, 1e-300)
-    for lag in range(1, min(longest, residuals[0].shape[1] - 1) + 1):
+    for lag in range(1, min(longest, max(r.shape[1] for r in residuals) - 1) + 1):
         products = [r[:, lag:] * r[:, :-lag] for r in residuals]
         pairs = max(sum(map(np.count_nonzero, products)), 1)
         yield sum(float(np.sum(p)) for p in products) / pairs / power, pairs

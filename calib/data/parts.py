@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.errors import InsufficientDataError
 
 BEGIN_S = 8.0
@@ -19,13 +20,14 @@ BEGIN_S = 8.0
 
 def part_of(problem: Problem, seconds: float) -> Problem:
     """Return the problem with evenly spread pieces of a second that add up to about ``seconds``."""
-    lengths = [len(e.sample) for e in problem.episodes]
-    period_s = problem.episodes[0].period_s
-    piece = max(round(1.0 / period_s), 1)
+    lengths_s = [len(e.sample) * e.period_s for e in problem.episodes]
     # Rounding must not make a whole of a half: the ratio of two recordings to their half may be 1.9999...
-    every = max(math.floor(sum(lengths) * period_s / seconds * (1 + 1e-9)), 1)
-    number = np.arange(sum(lengths)) // piece
-    kept = np.split(number % every == 0, np.cumsum(lengths)[:-1])
+    every = max(math.floor(sum(lengths_s) / seconds * (1 + 1e-9)), 1)
+    kept, before_s = [], 0.0
+    for episode, length_s in zip(problem.episodes, lengths_s, strict=True):
+        sample = round(before_s / episode.period_s) + np.arange(len(episode.sample))
+        kept.append(sample // max(round(1.0 / episode.period_s), 1) % every == 0)
+        before_s += length_s
     return problem.part(kept) if every > 1 else problem
 
 
@@ -44,8 +46,11 @@ def measurements(windows: Sequence[WindowData]) -> int:
 
 
 def samples_in(problem: Problem, seconds: float) -> int:
-    """Return the number of samples in a time: at least 1 from known start states, 4 from fitted ones."""
-    return max(round(seconds / problem.episodes[0].period_s), 1 if problem.noise_free else 4)
+    """Return the number of the slowest recording's samples in a time.
+
+    It is at least 1 from known start states, 4 from fitted ones.
+    """
+    return max(round(seconds / problem.period_s), 1 if problem.noise_free else 4)
 
 
 def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
@@ -54,7 +59,7 @@ def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
     Raises:
         InsufficientDataError: Even windows of four samples do not fit.
     """
-    length = max(round(seconds / problem.episodes[0].period_s), 4)
+    length = max(round(seconds / problem.period_s), 4)
     while True:
         try:
             return problem.windows(length)

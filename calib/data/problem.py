@@ -26,6 +26,7 @@ from deal_hw.calib.data.noise import (
     white_noise_std,
 )
 from deal_hw.calib.data.population_policy import PopulationPolicy
+from deal_hw.calib.data.window_data import MemberPrediction, WindowData
 from deal_hw.calibration import LATENCY, LATENCY_RANGE_S
 from deal_hw.description import EFFORT_UNITS
 from deal_hw.errors import ConfigurationError, InsufficientDataError
@@ -33,13 +34,13 @@ from deal_hw.parameters import LONGEST_LATENCY_S, Parameter, ParameterSpace
 from deal_hw.sim.engine.batch import BatchPool, ServoBatch
 from deal_hw.sim.engine.effort import effort_joints
 from deal_hw.sim.engine.gpu import EngineName
-from deal_hw.sim.engine.model import RobotModel
+from deal_hw.sim.engine.model import RobotModel, fitted_step
 from deal_hw.sim.engine.trees import independent_trees, reached
 from deal_hw.sim.parameters import SENSOR_NOISE
 from deal_hw.sim.parameters.effort import EFFORT_NOISE
 from deal_hw.sim.recordings.episode import SampledEpisode, fill_gaps
 from deal_hw.sim.recordings.own_setups import in_own_setups
-from deal_hw.sim.recordings.windows import Windows, cut_windows, predict_windows, setpoints
+from deal_hw.sim.recordings.windows import cut_windows, predict_windows, setpoints
 from deal_hw.task_map import InThisProcess, TaskMap
 from deal_hw.types import FloatArray, IntArray
 
@@ -57,66 +58,14 @@ SLOWEST_JITTER_S = 0.01
 VELOCITY_PRIOR_STD: Mapping[str, float] = {"m": 3.0, "rad": 30.0}
 """Weak prior on start velocities [m/s and rad/s]; keeps windows of few samples solvable."""
 
+SHORTEST_WINDOW = 4
+"""Samples of a window at least: with fewer, start states that are fitted take all that it shows [-]."""
+
 TOGETHER = 64
 """Members that are simulated together where laws act between the steps, by copies for several windows."""
 
 UNSEEN_STD = 1e-6
 """Prior on an unmeasured place of the base on the floor [m]; no trajectory depends on it."""
-
-
-@dataclass(frozen=True, slots=True)
-class WindowData:
-    """Windows of one episode with their measured samples.
-
-    Attributes:
-        episode: Index of the episode.
-        windows: W windows of H samples.
-        measured: Measured channels at the predicted samples, (W, H, M).
-        std: Standard deviation of the measured channels, (W, H, M); infinite for missing samples.
-        start_position: Smoothed start positions, (W, C).
-        start_velocity: Smoothed start velocities, (W, C).
-        prior_mean: Prior of the start states: a measurement, an estimate or a weak guess, (W, 2 C).
-        prior_std: Its standard deviation, (W, 2 C).
-        prior_counts: Entries of the prior that count as measurements, (2 C,).
-        late: Scaled directions in which delays move whitened predictions, (W, H M, P); None: constant delays.
-        by_delay: Change of whitened predictions by each command's delay, (W, H M, P) [1/s]; likewise None.
-    """
-
-    episode: int
-    windows: Windows
-    measured: FloatArray
-    std: FloatArray
-    start_position: FloatArray
-    start_velocity: FloatArray
-    prior_mean: FloatArray
-    prior_std: FloatArray
-    prior_counts: Mask
-    late: FloatArray | None = None
-    by_delay: FloatArray | None = None
-
-    def whitened(self, error: FloatArray) -> FloatArray:
-        """Return prediction errors or their changes, (..., W, H, M), in units of their standard deviation.
-
-        Those of samples that were not measured are 0.
-        """
-        alone = error / self.std
-        if self.late is None:
-            return np.asarray(alone)
-        flat = alone.reshape(*alone.shape[:-2], -1)
-        # The symmetric root keeps each residual at its sample.
-        shared = np.einsum("wrp,...wr->...wp", self.late, flat)
-        return np.asarray((flat - np.einsum("wrp,...wp->...wr", self.late, shared)).reshape(alone.shape))
-
-    @property
-    def reported(self) -> Mask:
-        """Which samples were measured, (W, H, M); the others filled a gap."""
-        return np.asarray(np.isfinite(self.std))
-
-    @property
-    def freedom(self) -> IntArray:
-        """Measurements minus unknowns of the start state, (W,); priors that count are measurements."""
-        priors = np.sum(np.isfinite(self.prior_std) & self.prior_counts, axis=1)
-        return np.asarray(np.sum(self.reported, axis=(1, 2)) + priors - self.prior_mean.shape[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,21 +86,6 @@ class CommandDelays:
     shift: tuple[Mapping[int, int], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class MemberPrediction:
-    """Predictions of W windows of H samples by N members; NaN where a member diverged.
-
-    Attributes:
-        observed: Measured channels, (N, W, H, M).
-        position: Tangent coordinates, (N, W, H, C).
-        velocity: (N, W, H, C).
-    """
-
-    observed: FloatArray
-    position: FloatArray
-    velocity: FloatArray
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
     """Recordings, their noise, a simulator, and parameters; none of them changes.
@@ -163,7 +97,8 @@ class Problem:
     Attributes:
         robot: The nominal model.
         space: The searched parameters.
-        episodes: Recordings with equal measured channels. Short gaps are interpolated and not fitted.
+        episodes: Recordings with equal measured channels, each on its own grid. Short gaps are interpolated
+            and not fitted.
         threads: Simulation threads; None for all CPUs.
         latency_range_s: Range of the total latency [s]; widened to include a given latency.
         fixed_latency_s: A given latency [s]; None to search it.
@@ -301,16 +236,16 @@ class Problem:
         return np.asarray(found)
 
     def _noise_model(self) -> NoiseModel:
-        slow = self.episodes[0].period_s > SLOWEST_JITTER_S
-        if self.known_std is not None or self.noise_free or slow:
+        fast = [i for i, e in enumerate(self.episodes) if e.period_s <= SLOWEST_JITTER_S]
+        if self.known_std is not None or self.noise_free or not fast:
             return NoiseModel(self.noise_std[self.channels], 0.0)
         C, rotation = self.coordinates, self.robot.rotation
         # Jitter of sample times shows in positions; a rotation about the smoothed orientation has none left.
         timed = [i for i, c in enumerate(self.channels) if c < C and not rotation.start <= c < rotation.stop]
         columns = self.channels[timed]
-        positions = [e.position[:, columns] for e in self.episodes]
-        speeds = [s.velocity[:, columns] for s in self.starts]
-        reported = [e.reported for e in self.episodes]
+        positions = [self.episodes[i].position[:, columns] for i in fast]
+        speeds = [self.starts[i].velocity[:, columns] for i in fast]
+        reported = [self.episodes[i].reported for i in fast]
         moved = noise_model(positions, speeds, reported)
         std = self.noise_std[self.channels]
         std[timed] = moved.position_std
@@ -389,6 +324,21 @@ class Problem:
         return all(e.noise_free for e in self.episodes)
 
     @property
+    def period_s(self) -> float:
+        """Sampling period of the slowest recording, in which lengths of windows are counted [s]."""
+        return max(e.period_s for e in self.episodes)
+
+    @property
+    def rates(self) -> int:
+        """Number of different sampling rates of the recordings."""
+        return len({e.period_s for e in self.episodes})
+
+    @property
+    def step_s(self) -> float:
+        """Longest device period of the recordings [s]."""
+        return max(e.step_s for e in self.episodes)
+
+    @property
     def coordinates(self) -> int:
         """Tangent coordinates C of a state."""
         return int(self.episodes[0].position.shape[1])
@@ -430,15 +380,20 @@ class Problem:
     def batch(self, count: int, index: int, *, population: bool = False) -> ServoBatch:
         """Return the simulator of ``count`` members in the set-up of an episode; the last sizes are kept.
 
-        The members of a search's ``population`` are simulated by the problem's engine.
+        Its physics step fits the episode's grid. The members of a search's ``population`` are simulated by
+        the problem's engine.
         """
-        return self._batches.get(count, self.episodes[index].setup, self.engine if population else "mujoco")
+        engine = self.engine if population else "mujoco"
+        return self._batches.get(count, self.episodes[index].setup, engine, self._physics_step_s(index))
+
+    def _physics_step_s(self, index: int) -> float:
+        return fitted_step(self.episodes[index].step_s, self.robot.step_s)
 
     def batches(self, count: int, index: int) -> list[ServoBatch]:
         """Return simulators of a search's population of ``count`` members: on a CPU one for each thread."""
         if self.engine != "mujoco":
             return [self.batch(count, index, population=True)]
-        return self._batches.parts(count, self.episodes[index].setup)
+        return self._batches.parts(count, self.episodes[index].setup, self._physics_step_s(index))
 
     def reach(self, index: int) -> Mask:
         """Return which coordinates each free parameter moves in an episode, (K, C); in other set-ups none."""
@@ -463,17 +418,26 @@ class Problem:
             own[:] = False if episode.effort is None else np.isfinite(episode.effort[:, list(self.efforts)])
         return found if episode.reported is None else found & episode.reported[:, None]
 
-    def windows(self, length: int, offset: int = 0) -> list[WindowData]:
-        """Cut all episodes into windows that predict ``length`` samples, H; none starts before ``offset``.
+    def windows(self, length: int, offset: int = 0, *, shorter: bool = True) -> list[WindowData]:
+        """Cut all episodes into windows that predict ``length`` samples; none starts before ``offset``.
+
+        Both count samples of the slowest recording. Windows of the others last as long, so they predict more
+        samples, H. Beside recordings that hold such a window, a shorter one is one window as a whole, unless
+        ``shorter`` is False.
 
         Raises:
             InsufficientDataError: No episode holds a window.
         """
         found: list[WindowData] = []
-        problem = ""
+        problem, period_s, whole = "", self.period_s, False
         for index, episode in enumerate(self.episodes):
+            faster = period_s / episode.period_s
+            own, first = round(faster * length), round(faster * offset)
+            holds = len(episode.sample) - 1 - first
+            if shorter and round(faster * SHORTEST_WINDOW) <= holds < own:
+                own = holds
             try:
-                windows = cut_windows(episode, length, offset, self.latency_range_s[1])
+                windows = cut_windows(episode, own, first, self.latency_range_s[1])
             except InsufficientDataError as err:
                 problem = str(err)
                 continue
@@ -497,8 +461,12 @@ class Problem:
                     prior_counts=counts,
                 )
             )
-        if not found:
-            raise InsufficientDataError(problem)
+            whole |= own == round(faster * length)
+        if not whole:
+            raise InsufficientDataError(
+                problem
+                or f"no recording holds a window of {length * period_s:.2f} s; record a longer episode"
+            )
         return found
 
     def _prior(self, index: int, std: FloatArray) -> tuple[FloatArray, FloatArray, Mask]:

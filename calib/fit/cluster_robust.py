@@ -49,13 +49,13 @@ class Clustered:
     """Blocks of one length, and the uncertainty of P coordinates that they show.
 
     Attributes:
-        block_samples: Samples of a block.
+        block_windows: Windows in a block, or its share of one.
         shift: Shift of the estimate by each block's score, (B, P).
         expected: Its variance under independent residuals of unit variance, (B, P).
         follows: Blocks that come right after the one before them, (B - 1,).
     """
 
-    block_samples: int
+    block_windows: float
     shift: FloatArray
     expected: FloatArray
     follows: npt.NDArray[np.bool_]
@@ -90,19 +90,21 @@ class Clustered:
 
 
 def clustered(
-    rows: Sequence[WindowRows], bread: FloatArray, samples: int, correlation_samples: float = 1.0
+    rows: Sequence[WindowRows], bread: FloatArray, samples: Sequence[int], correlation_samples: float = 1.0
 ) -> Clustered | None:
     """Compare the cluster-robust covariance with ``bread``, that of independent residuals of unit variance.
 
-    The latter, (P, P), has zero rows and columns for fixed coordinates. Windows have ``samples`` samples.
+    The latter, (P, P), has zero rows and columns for fixed coordinates. Windows have ``samples`` samples, one
+    number an episode: they last equally long in all of them.
     Blocks are at least twice as long as the residuals' autocorrelation time. It is None where the recordings
     hold too few blocks.
     """
     if not rows:
         return None
     found: Clustered | None = None
-    for parts, group in _levels(rows, samples):
-        length = group * samples // parts
+    fewest = min(samples)
+    for parts, group in _levels(rows, fewest):
+        length = group * fewest // parts
         if length < max(SHORTEST_PART, 2 * correlation_samples) and parts > 1:
             continue
         level = _level(rows, bread, samples, parts, group)
@@ -124,9 +126,11 @@ def _levels(rows: Sequence[WindowRows], samples: int) -> list[tuple[int, int]]:
     return levels
 
 
-def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: int, group: int) -> Clustered:
+def _level(
+    rows: Sequence[WindowRows], bread: FloatArray, every: Sequence[int], parts: int, group: int
+) -> Clustered:
     shifts, expected, follows = [], [], []
-    for of_episode in rows:
+    for of_episode, samples in zip(rows, every, strict=True):
         J = of_episode.following
         W, R, P = J.shape
         S = of_episode.start.shape[2]
@@ -155,5 +159,5 @@ def _level(rows: Sequence[WindowRows], bread: FloatArray, samples: int, parts: i
         shifts.append(g @ bread)
         expected.append(np.maximum(np.einsum("pi,bij,jp->bp", bread, spread, bread), 0.0))
         follows.append(np.concatenate([[False], np.ones(len(g) - 1, dtype=bool)]))
-    length = group * samples // parts
-    return Clustered(length, np.concatenate(shifts), np.concatenate(expected), np.concatenate(follows)[1:])
+    windows = group / parts
+    return Clustered(windows, np.concatenate(shifts), np.concatenate(expected), np.concatenate(follows)[1:])

@@ -23,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.windows import setpoints
 from deal_hw.types import FloatArray, IntArray

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from deal_hw.calib.data.noise import autocorrelations
+from deal_hw.calib.data.noise import alike, autocorrelations
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import expected_directions, null_directions, null_space
@@ -208,16 +208,23 @@ class Uncertainty:
         return max(high - latency_s, latency_s - low)
 
 
-def correlation_time(residuals: tuple[FloatArray, ...], chance: float | None = None) -> float:
+def correlation_time(
+    residuals: Sequence[FloatArray], chance: float | None = None, periods_s: Sequence[float] = ()
+) -> float:
     """Return the integrated autocorrelation time of whitened residuals, (W, H, J) each, in samples.
 
-    It is that of the worst channel, over all recordings: each recording alone is short, and the worst of many
-    would be far from white by chance. White residuals have 1. Samples that filled a gap do not count: their
-    whitened residual is exactly 0. With a ``chance``, it is a lower bound instead, which the true time of any
-    channel is below with this probability.
+    It is that of the worst channel, over all recordings of one rate: each recording alone is short, and the
+    worst of many would be far from white by chance. White residuals have 1. Samples that filled a gap do not
+    count: their whitened residual is exactly 0. With a ``chance``, it is a lower bound instead, which the
+    true time of any channel is below with this probability. Without ``periods_s``, one an episode, all have
+    one rate.
     """
     worst = 1.0
-    channels = list(zip(*(np.moveaxis(r, 2, 0) for r in residuals), strict=True))
+    channels = [
+        channel
+        for rows in alike(periods_s or [0.0] * len(residuals))
+        for channel in zip(*(np.moveaxis(residuals[e], 2, 0) for e in rows), strict=True)
+    ]
     below = 0.0 if chance is None else float(scipy.stats.norm.ppf(1 - chance / len(channels)))
     for channel in channels:
         total, used = 1.0, 0
@@ -252,8 +259,8 @@ def uncertainty(
     for nonlinearity.
     """
     K = len(space)
-    tau = correlation_time(normal.residual)
-    least_tau = correlation_time(normal.residual, FALSE_ALARMS)
+    tau = correlation_time(normal.residual, periods_s=normal.periods_s)
+    least_tau = correlation_time(normal.residual, FALSE_ALARMS, normal.periods_s)
     inflation = kinks**2 * max(1.0, chi2) * tau
     slope, known = normal.gradient, normal.prior
     data = normal.hessian - np.diag(known)
@@ -268,7 +275,7 @@ def uncertainty(
     # V of the module's text, with the entries at bounds and a given latency held.
     precision = data / inflation + np.diag(belief)
     covariance = _covariance(precision, free)
-    cluster = clustered(normal.rows, covariance / inflation, normal.residual[0].shape[1], tau)
+    cluster = clustered(normal.rows, covariance / inflation, [r.shape[1] for r in normal.residual], tau)
     factor = _factor(cluster, max(1.0, chi2) * tau, inflation)
     # Directions without information stay as wide as the range, however autocorrelated residuals are.
     factor = np.minimum(factor, np.sqrt(1.0 / (belief * np.maximum(np.diag(covariance), 1e-300))))
@@ -318,7 +325,7 @@ def latency_end(problem: Problem, latency_s: float, searched_s: tuple[float, flo
     if problem.fixed_latency_s is not None:
         return 0
     low, high = searched_s
-    near = max(LATENCY_AT_END * (high - low), 0.5 * problem.episodes[0].step_s)
+    near = max(LATENCY_AT_END * (high - low), 0.5 * problem.step_s)
     if latency_s > high - near:
         return 1
     return -1 if low > 0 and latency_s < low + near else 0

@@ -17,8 +17,10 @@ from functools import cached_property
 
 import numpy as np
 
+from deal_hw.calib.data.noise import alike
 from deal_hw.calib.data.parts import longest_windows
-from deal_hw.calib.data.problem import Member, Problem, WindowData
+from deal_hw.calib.data.problem import Member, Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting
 from deal_hw.calib.fit.solver import (
     SolverSettings,
@@ -159,7 +161,9 @@ def fit_output_error(
     if problem.fixed_latency_s is None:
         latency_s = float(np.clip(latency_s, *problem.latency_range_s))
     windows = longest_windows(problem, recipe.seconds)
-    length, share = windows[0].windows.length, recipe.prior_std
+    # Short recordings have shorter windows.
+    lengths_s = [data.windows.length * problem.episodes[data.episode].period_s for data in windows]
+    length, share = round(max(lengths_s) / problem.period_s), recipe.prior_std
     plain = Shooting(problem, length, windows, given=True, prior_share=share, fixed_latency=fixed)
     point = plain.start(np.clip(theta, space.low, space.high), latency_s)
     left = recipe.iterations if iterations is None else iterations
@@ -231,12 +235,13 @@ def _weighed(
     errors = [_errors(d, r) for d, r in zip(plain.data, plain.residuals(point), strict=True)]
     seen = [d.reported for d in plain.data]
     scale = channel_scale(errors, seen, recipe.robust)
-    correlation = 1.0
-    if correlated:
-        longest = round(recipe.longest_lag_s / problem.episodes[0].period_s)
-        correlation = correlated_samples([e / scale for e in errors], longest)
+    correlations = np.ones(len(errors))
+    periods_s = [problem.episodes[d.episode].period_s for d in plain.data]
+    for rows in alike(periods_s) if correlated else ():
+        longest = round(recipe.longest_lag_s / periods_s[rows[0]])
+        correlations[rows] = correlated_samples([errors[e] / scale for e in rows], longest)
     data = []
-    for d, error, reported in zip(plain.data, errors, seen, strict=True):
+    for d, error, reported, correlation in zip(plain.data, errors, seen, correlations, strict=True):
         weight = huber_weights(error / scale) if recipe.robust else np.ones_like(error)
         std = np.where(reported, scale * np.sqrt(correlation / weight), np.inf)
         data.append(dataclasses.replace(d, std=std))

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.refinement import Refined, refined_at
 from deal_hw.calib.fit.residual import LATENCY_STEP_S, Normal, Point, Shooting, WindowRows, value_bounds
 from deal_hw.types import FloatArray

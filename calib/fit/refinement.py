@@ -277,7 +277,7 @@ def _whole_step(
 
     A search may end one step beside it.
     """
-    step_s = problem.episodes[0].step_s
+    step_s = problem.step_s
     low, high = (round(v / step_s) for v in problem.latency_range_s)
     nearest = round(latency_s / step_s)
     beside = sorted((nearest - 1, nearest + 1), key=lambda tick: abs(tick * step_s - latency_s))

@@ -27,7 +27,8 @@ from functools import cached_property
 import numpy as np
 
 from deal_hw.calib.data.noise import Mask
-from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import MemberPrediction, WindowData
 from deal_hw.calib.fit.command_delays import with_command_delays
 from deal_hw.sim.engine.trees import sharing
 from deal_hw.sim.parameters.laws import SERVO_PUNCH, SERVO_RESOLUTION
@@ -159,6 +160,7 @@ class Normal:
         back: Per episode, gain from parameter steps to start-state steps, (W, 2C, K + 1), and the start
             states' own step, (W, 2C).
         rows: Linearised residuals per episode, if requested.
+        periods_s: Sampling period of each episode [s]; empty: one rate.
     """
 
     cost: float
@@ -169,10 +171,13 @@ class Normal:
     prior: FloatArray
     back: tuple[tuple[FloatArray, FloatArray], ...] = ()
     rows: tuple[WindowRows, ...] = ()
+    periods_s: tuple[float, ...] = ()
 
 
 class Shooting:
     """Residuals, normal equations and candidate steps for one cut into windows of ``length`` samples.
+
+    ``length`` counts as that of :meth:`Problem.windows`.
 
     Start states are ``given``, the smoothed ones, or each is an unknown; exact states are always given.
     ``prior_share`` is the spread of parameters without a prior around their nominal values as a share of
@@ -232,9 +237,10 @@ class Shooting:
             self._state_step = np.maximum(CONTACT_STATE_STEP * self.state_std, self._state_step)
 
     @property
-    def device_periods(self) -> int:
-        """Device periods in all windows."""
-        return sum(len(d.windows) * d.windows.length * d.windows.stride for d in self.data)
+    def seconds(self) -> float:
+        """Length of all windows together [s]."""
+        cut = [(d.windows, self.problem.episodes[d.episode].step_s) for d in self.data]
+        return sum(len(w) * w.length * w.stride * step_s for w, step_s in cut)
 
     @property
     def contacts(self) -> bool:
@@ -292,7 +298,7 @@ class Shooting:
             predicted = self._predict(point.value[None], data, start_x, start_v)
             x[data.windows.start], v[data.windows.start] = point.position[e], point.velocity[e]
             # The last sample of a window is the start of the next, where it has a state of its own.
-            last = self.length if handed_on else self.length - 1
+            last = data.windows.length if handed_on else data.windows.length - 1
             inner = data.windows.samples()[:, :last]
             x[inner], v[inner] = predicted.position[0, :, :last], predicted.velocity[0, :, :last]
         return found
@@ -384,7 +390,8 @@ class Shooting:
             gradient -= np.einsum("wsi,ws->i", msp, solved[..., -1])
             cost += float(np.sum(information * start**2))
             count += int(np.sum(data.freedom))
-        found = tuple(residuals), self.prior_information, tuple(back), tuple(rows)
+        periods_s = tuple(self.problem.episodes[d.episode].period_s for d in self.data)
+        found = tuple(residuals), self.prior_information, tuple(back), tuple(rows), periods_s
         return Normal(cost, count, hessian, gradient, *found)
 
     def followed(self, point: Point, normal: Normal, step: FloatArray) -> Point:

@@ -31,9 +31,9 @@ import numpy as np
 import scipy
 from scipy.optimize import lsq_linear
 
-from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations
+from deal_hw.calib.data.noise import MAD_TO_STD, Mask, alike, autocorrelations
 from deal_hw.calib.data.parts import taken
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
 from deal_hw.types import FloatArray
 
@@ -408,8 +408,27 @@ def channel_scale(errors: Sequence[FloatArray], seen: Sequence[np.ndarray], robu
 def correlated_samples(residuals: Sequence[FloatArray], longest: int) -> float:
     """Return one plus twice the sum of the residuals' correlations up to their first zero, at least 1.
 
-    Residuals are whitened, (W, H, M) per episode, and 0 for missing samples; lags end at ``longest`` samples.
+    Residuals are whitened, (W, H, M) per episode of one rate, and 0 for missing samples; lags end at
+    ``longest`` samples.
     """
     # tau = 1 + 2 sum_k rho_k (Madras and Sokal 1988), up to the first rho_k <= 0.
     positive = itertools.takewhile(lambda found: found[0] > 0, autocorrelations(residuals, longest))
     return sum((2 * correlation for correlation, _ in positive), 1.0)
+
+
+def independent_samples(
+    residuals: Sequence[FloatArray], counts: Sequence[float], periods_s: Sequence[float]
+) -> float:
+    """Return how many samples are independent: at each rate their number over their correlation time.
+
+    Args:
+        residuals: Of each episode, as in :func:`correlated_samples`; lags end with the windows.
+        counts: Samples of each episode.
+        periods_s: Sampling period of each episode [s].
+    """
+    found = 0.0
+    for rows in alike(periods_s):
+        of_rate = [residuals[e] for e in rows]
+        longest = max(r.shape[1] for r in of_rate)
+        found += sum(counts[e] for e in rows) / correlated_samples(of_rate, longest)
+    return found

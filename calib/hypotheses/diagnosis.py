@@ -302,7 +302,7 @@ def _zero_diagnosis(
 
 def _varying_delay(known: Evidence, taken: Sequence[Signature]) -> Diagnosis | None:
     """Return whether commands seem to have delays of their own beside other causes; see `.random_delay`."""
-    found = random_delay(SeenErrors(known.without(taken), known.answers, known.period_s))
+    found = random_delay(SeenErrors(known.without(taken), known.answers, known.periods_s))
     if found is None or not (found.gain > EVIDENCE and found.share > NOTICED):
         return None
     if found.std_s > known.most_delay_std_s:
@@ -334,7 +334,7 @@ def _bursts(known: Evidence, residual: Sequence[FloatArray]) -> Diagnosis | None
     share = float(each[most].sum() / max(each.sum(), 1e-300))
     if kurtosis(values) < BURST_KURTOSIS or share < BURST_SHARE:
         return None
-    unit_s = 10 * known.period_s
+    unit_s = 10 * max(known.periods_s)
     stretches = [
         f"{name} {stretch}".strip()
         for name in dict.fromkeys(known.names)

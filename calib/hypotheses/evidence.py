@@ -18,7 +18,7 @@ from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import ended_at_bound
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import WindowRows
-from deal_hw.calib.fit.solver import correlated_samples
+from deal_hw.calib.fit.solver import independent_samples
 from deal_hw.calib.hypotheses.cause_words import SearchedKinds
 from deal_hw.calib.hypotheses.random_delay import most_delay_std_s
 from deal_hw.calib.hypotheses.signatures import (
@@ -53,7 +53,7 @@ class Evidence:
         rows: Linearised residuals, per episode.
         prior: Information on the parameters and the latency, (P,).
         found: Signatures of the causes.
-        period_s: Sampling period [s].
+        periods_s: Sampling period of each episode [s].
         answers: Responses of the windows to commands, per episode; empty if unknown, or if each command's
             delay was an unknown of the fit.
         time_s: Time of each sample in its recording, per episode (W, H) [s].
@@ -65,7 +65,7 @@ class Evidence:
     rows: Sequence[WindowRows]
     prior: FloatArray
     found: Sequence[Signature]
-    period_s: float
+    periods_s: Sequence[float]
     answers: Sequence[SignatureResponse] = ()
     time_s: Sequence[FloatArray] = ()
     names: Sequence[str] = ()
@@ -169,10 +169,11 @@ class Evidence:
     def count(self) -> float:
         """Number of independent residuals: degrees of freedom over the residuals' correlation time."""
         # A missing sample has a residual of 0.
-        measured = sum(int(np.count_nonzero(r)) for r in self._rest)
-        degrees = max(measured - sum(len(r.start) * int(r.start.shape[2]) for r in self.rows), 1)
-        residual = self.by_sample(self.residual([]))
-        return degrees / correlated_samples(residual, residual[0].shape[1])
+        degrees = [
+            int(np.count_nonzero(rest)) - len(rows.start) * int(rows.start.shape[2])
+            for rest, rows in zip(self._rest, self.rows, strict=True)
+        ]
+        return max(independent_samples(self.by_sample(self.residual([])), degrees, self.periods_s), 1.0)
 
     def held_out(self, taken: Sequence[Signature]) -> float:
         """Return the total cost of each fold's windows with the regression fitted to the others."""
@@ -239,7 +240,7 @@ def evidence(problem: Problem, refined: Refined, *, answered: bool = True) -> Ev
         prior=parameter_prior(problem),
         found=by_recording(signatures(problem, refined), names),
         answers=answers(problem, refined) if answered and problem.command_delays is None else (),
-        period_s=problem.episodes[0].period_s,
+        periods_s=[e.period_s for e in episodes],
         time_s=[
             np.asarray((e.origin + e.sample[d.windows.samples()]) * e.step_s)
             for e, d in zip(episodes, data, strict=True)

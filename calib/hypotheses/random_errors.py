@@ -22,7 +22,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.command_delays import FreeRows, command_times, delay_columns, free_rows
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, Uncertainty, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined, refine_windows
@@ -76,7 +76,7 @@ class SeenErrors:
     Attributes:
         rows: Per episode.
         answers: Per episode.
-        period_s: Sampling period [s].
+        periods_s: Sampling period of each episode [s].
         columns: Changes by the delay of each command, per episode (W, H M, P) [1/s]. Without them each
             sample's change of a set-point has a delay.
         times: Times of these commands, (W, P) [s].
@@ -84,7 +84,7 @@ class SeenErrors:
 
     rows: Sequence[WindowRows]
     answers: Sequence[SignatureResponse]
-    period_s: float
+    periods_s: Sequence[float]
     columns: Sequence[FloatArray] | None = None
     times: Sequence[FloatArray] | None = None
 
@@ -104,7 +104,7 @@ class SeenErrors:
         return cls(
             list(shooting.normal(fit.point, keep=True).rows),
             answers(problem, dataclasses.replace(fit, shooting=shooting)),
-            problem.episodes[0].period_s,
+            [problem.episodes[data.episode].period_s for data in shooting.data],
             columns,
             [command_times(problem, data, column.shape[2]) for data, column in pairs],
         )
@@ -186,7 +186,7 @@ class ErrorWindow:
             response=answer.response[:, w, :H],
             change=answer.change[w, :H],
             rms=rms,
-            period_s=seen.period_s,
+            period_s=seen.periods_s[e],
             late=None if seen.columns is None else seen.columns[e][w, : H * M].T,
             time_s=None if seen.times is None else seen.times[e][w],
         )
@@ -234,7 +234,7 @@ class Covariance:
     @classmethod
     def of(cls, windows: Sequence[ErrorWindow], process: Process) -> Covariance:
         """Return that of a process."""
-        columns = [window.effects(process) @ window.basis for window in windows]
+        columns = _padded([window.effects(process) @ window.basis for window in windows])
         every = np.stack([c.T @ c for c in columns])
         scale = max(float(np.mean(np.einsum("wdd->wd", every))), 1e-300)
         return cls(every / scale, scale)
@@ -377,15 +377,16 @@ def fit_errors(before: Refined) -> ErrorFit | None:
 
 def likely_errors(windows: Sequence[ErrorWindow], covariances: dict[Process, Covariance]) -> RandomErrors:
     """Return the likeliest sizes of processes beside white noise; none of them is white noise alone."""
-    residual = np.stack([window.residual for window in windows])
-    followed = np.stack([window.parameter for window in windows])
+    # What pads a window is no error of any process, and white noise without a residual: it says nothing.
+    residual = np.stack(_padded([window.residual for window in windows]))
+    followed = np.stack([np.transpose(x) for x in _padded([window.parameter.T for window in windows])])
     W, D = residual.shape
     unit = np.broadcast_to(np.eye(D), (W, D, D))
     power = np.einsum("wdp,wdp->p", followed, followed)
     # Where the windows show nothing of a parameter, it follows nothing.
     seen = power > 0
     followed, weak = followed[..., seen] / np.sqrt(power[seen]), 1e-9 * np.eye(int(seen.sum()))
-    count = residual.size - int(seen.sum())
+    count = sum(window.residual.size for window in windows) - int(seen.sum())
 
     def likelihood(log_ratios: FloatArray) -> tuple[float, FloatArray, float]:
         """Return deviance, its gradient, and the noise's variance."""
@@ -439,11 +440,16 @@ def whitened_for(
         g, U = np.linalg.eigh(both.T @ both)
         kept = g > NO_VARIANCE
         roots.append(U[:, kept] * np.sqrt(1.0 - 1.0 / np.sqrt(1.0 + g[kept])))
-    most = max(root.shape[1] for root in roots)
-    padded = [np.pad(root, ((0, 0), (0, most - root.shape[1]))) for root in roots]
+    padded = _padded(roots)
     found, at = [], 0
     for each in data:
         W = len(each.windows)
         found.append(dataclasses.replace(each, late=np.stack(padded[at : at + W]), by_delay=None))
         at += W
     return found
+
+
+def _padded(arrays: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return arrays, (..., n) each, with zeros up to the longest last axis; windows differ in samples."""
+    most = max(a.shape[-1] for a in arrays)
+    return [np.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, most - a.shape[-1])]) for a in arrays]

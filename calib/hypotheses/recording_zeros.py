@@ -111,7 +111,7 @@ def fitted_zeros(problem: Problem, theta: FloatArray, latency_s: float) -> Float
         for p in space.holding(np.append(theta, space.nominal[K:])).parameters
     )
     part = problem.with_space(known).sharing(fixed_latency_s=latency_s)
-    window_s = samples_in(part, WINDOW_S) * part.episodes[0].period_s
+    window_s = samples_in(part, WINDOW_S) * part.period_s
     try:
         found = refine(part, known.nominal, latency_s, (window_s,))
     except InsufficientDataError:

@@ -27,7 +27,6 @@ from deal_hw.calib.hypotheses.judge import UnseenGain, needed
 from deal_hw.calib.hypotheses.thresholds import CORRECTIONS_ALIKE, NOTICED_CORRECTION, WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
 from deal_hw.findings import Finding
-from deal_hw.sim.engine.model import at_step
 from deal_hw.sim.recordings.episode import SampledEpisode
 from deal_hw.sim.recordings.parts import spread, stretches
 from deal_hw.types import FloatArray
@@ -104,17 +103,12 @@ class ChannelChange:
 
     def on(self, problem: Problem, episodes: Sequence[SampledEpisode]) -> Problem:
         """Return the problem of changed recordings of a fixed-base robot, with the noise scaled alike."""
-        facts, robot = problem.robot.description, problem.robot
+        facts = problem.robot.description
         changed = [self.of(e, facts.actuated_index, facts.servos) for e in episodes]
         joints, scale = list(self.source), np.abs(self.scale)
         position, velocity = np.split(problem.noise_std, 2)
         std = np.concatenate([scale * position[joints], scale / self.clock * velocity[joints]])
-        # A device period is a whole number of physics steps.
-        steps = changed[0].step_s / robot.step_s
-        if abs(steps - round(steps)) < 1e-6 and round(steps) >= 1:
-            return problem.on(changed, std)
-        robot = at_step(robot, changed[0].step_s / math.ceil(steps))
-        return dataclasses.replace(problem, robot=robot, episodes=changed, known_std=std)
+        return problem.on(changed, std)
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,7 +393,7 @@ def _fitted(
 
     try:
         train = change.on(problem, seen)
-        window_s = length * train.episodes[0].period_s
+        window_s = length * train.period_s
         fit = refine(
             train,
             problem.space.nominal,

@@ -14,7 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.noise import alike
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.parameters import Parameter
 from deal_hw.sim.engine.inverse_dynamics import link_torques
@@ -84,8 +86,8 @@ class SignatureResponse:
 
     Attributes:
         response: Whitened change of the predictions by a unit pulse of a set-point in the first sample,
-            (A, W, H, M) [1/(rad s) or 1/(m s)]. It is the mean over all windows; where friction holds a joint
-            it is zero.
+            (A, W, H, M) [1/(rad s) or 1/(m s)]. It is the mean over all windows of one length in
+            samples; where friction holds a joint it is zero.
         change: Change of the set-points from sample to sample, (W, H, A) [rad or m].
     """
 
@@ -187,9 +189,15 @@ def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
         responses.append((observed[1:] - observed[:1]) / (NUDGE * stride * step_s))
         edges = np.minimum(at[:, None] + stride * np.arange(data.windows.length + 1), path.shape[1] - 1)
         changes.append(np.diff(path[0][edges], axis=1))
-    mean = np.nan_to_num(np.mean(np.concatenate(responses, axis=1), axis=1))
-    every = zip(fit.shooting.data, changes, strict=True)
-    return [SignatureResponse(mean[:, None] / data.std, change) for data, change in every]
+    means: dict[int, FloatArray] = {}
+    # Recordings of another rate, and short ones, have windows of another length.
+    for rows in alike([data.windows.length for data in fit.shooting.data]):
+        every = np.concatenate([responses[e] for e in rows], axis=1)
+        means |= dict.fromkeys(rows.tolist(), np.nan_to_num(np.mean(every, axis=1)))
+    return [
+        SignatureResponse(means[e][:, None] / data.std, change)
+        for e, (data, change) in enumerate(zip(fit.shooting.data, changes, strict=True))
+    ]
 
 
 def held_direction(velocity: FloatArray, speed: float) -> FloatArray:

@@ -77,7 +77,7 @@ def with_finer_step(run: CalibrationRun, local: Refined) -> FitOutcome | Calibra
         if not step.coarse or fit.chi2 * (1 - 4 / 3 * step.share) > MISMATCH_CHI2:
             break
         problem = halved(problem)
-        window_s = fit.shooting.length * problem.episodes[0].period_s
+        window_s = fit.shooting.length * problem.period_s
         states = fit.shooting.states(fit.point)
         fit = refine(problem, fit.theta, fit.latency_s, (window_s,), states=states)
     if problem is run.problem or not conclusive(problem, fit):

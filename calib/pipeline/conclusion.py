@@ -75,7 +75,7 @@ def conclude_fit(
         known = hold_windows(known, fit.latency_s, allowed.before)
     facts: dict[str, Any] = {
         "restarts": restarts,
-        "window_s": fit.shooting.length * problem.episodes[0].period_s,
+        "window_s": fit.shooting.length * problem.period_s,
         "noise_std": problem.noise.position_std.tolist(),
         "timing_std_s": problem.noise.timing_std_s,
         "refinement_iterations": fit.iterations,

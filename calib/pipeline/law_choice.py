@@ -22,7 +22,6 @@ import numpy as np
 
 from deal_hw.calib.data.folds import Choice, fold_masks
 from deal_hw.calib.data.noise import Mask
-from deal_hw.calib.data.parts import samples_in
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import latency_end
 from deal_hw.calib.fit.output_error import (
@@ -31,7 +30,7 @@ from deal_hw.calib.fit.output_error import (
     prediction_errors,
     prediction_rmse,
 )
-from deal_hw.calib.fit.solver import channel_scale, correlated_samples
+from deal_hw.calib.fit.solver import channel_scale, independent_samples
 from deal_hw.calib.hypotheses.candidates import Candidate, Judged, Outcome, ranked
 from deal_hw.calib.hypotheses.hypothesis import Hypothesis, values_in_words
 from deal_hw.calib.hypotheses.judge import UnseenGain, accepted
@@ -427,5 +426,5 @@ def _unexplained(problem: Problem, member: Member, seconds: float) -> tuple[Floa
     seen = [data.reported for data, _ in found]
     errors = [np.where(s, e[0], 0.0) for s, (_, e) in zip(seen, found, strict=True)]
     rms = channel_scale(errors, seen, robust=False)
-    longest = samples_in(problem, seconds)
-    return rms, int(np.sum([s.sum() for s in seen])) / correlated_samples([e / rms for e in errors], longest)
+    periods_s = [problem.episodes[data.episode].period_s for data, _ in found]
+    return rms, independent_samples([e / rms for e in errors], [int(s.sum()) for s in seen], periods_s)

@@ -176,7 +176,7 @@ def _fitted(problem: Problem, fit: Refined, more: Sequence[Parameter]) -> WiderF
 
 def _refined(problem: Problem, theta: FloatArray, begun: Refined) -> Refined | None:
     """Return a fit from values, (K,), and the latency, windows and start states of another."""
-    window_s = begun.shooting.length * problem.episodes[0].period_s
+    window_s = begun.shooting.length * problem.period_s
     states = begun.shooting.states(begun.point)
     try:
         return refine(problem, theta, begun.latency_s, (window_s,), states=states)

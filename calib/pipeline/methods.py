@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, cast
 
 from deal_hw.calibration import Budget, CalibrationMethod
-from deal_hw.errors import UnknownNameError
+from deal_hw.errors import ConfigurationError, UnknownNameError
 
 if TYPE_CHECKING:
     from deal_hw.calib.data.problem import Problem
@@ -117,6 +117,10 @@ WHOLE_METHODS = UNALIGNED_METHODS | {"output-error", "output-error-no-laws", "lo
 refined."""
 
 
+RATES_METHODS = NO_DATA_METHODS | {"eki", "local", "gait"}
+"""Methods, and searches, that take recordings of several rates. Others compare sample with sample."""
+
+
 def divided(name: str) -> tuple[str, str]:
     """Return a method's pipeline and its search; the search is "" where the name is no pipeline with one."""
     pipeline, plus, search = name.partition("+")
@@ -128,6 +132,23 @@ def divided(name: str) -> tuple[str, str]:
 def with_search(pipeline: str, search: str) -> str:
     """Return the name of a pipeline with a search inside it; the same name where it has none."""
     return pipeline if search == DEFAULT_SEARCH or pipeline not in SEARCHING else f"{pipeline}+{search}"
+
+
+def with_rates(name: str) -> str:
+    """Return a method for recordings of several rates: a pipeline's search is one that takes them.
+
+    Raises:
+        ConfigurationError: The method takes one rate only.
+    """
+    pipeline, search = divided(name)
+    if search:
+        return pipeline + "+eki"
+    if name not in RATES_METHODS:
+        raise ConfigurationError(
+            f"--method {name} takes recordings of one rate, and these have several; leave out --method, or "
+            "calibrate the recordings of one rate"
+        )
+    return name
 
 
 def is_default(name: str) -> bool:

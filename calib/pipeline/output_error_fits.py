@@ -442,8 +442,7 @@ class OutputErrorFits(Fits):
         before, values = problem.steps, 1 + len(problem.space) / problem.independent
         # Derivatives by each value and the latency, each with its steps; central ones at the end.
         members = HALF_DERIVATIVES * (values + 1 + SECANTS) + 2 * values
-        substeps = problem.episodes[0].step_s / problem.robot.step_s
-        cost = float(members * fit.plain.device_periods * substeps)
+        cost = float(members * fit.plain.seconds / problem.robot.step_s)
         if not run.allows(HALVES, cost):
             return SplitHalf(note=f"left out: it would take {cost:.1g} physics steps")
         parts = map(problem.part, fold_masks(problem, 2))

@@ -11,7 +11,8 @@ import numpy as np
 
 from deal_hw.calib.data.innovations import Members, whitened_residual
 from deal_hw.calib.data.parts import longest_windows, samples_in
-from deal_hw.calib.data.problem import MemberPrediction, Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import MemberPrediction, WindowData
 from deal_hw.calib.hypotheses.recording_zeros import fitted_zeros, with_other_zeros
 from deal_hw.calib.validation.residual_place import quantities, size_over
 from deal_hw.calibration import CalibrationResult
@@ -181,7 +182,7 @@ def gather(
         drawing=drawing,
         heldout=tuple(dict.fromkeys(e.name for e in holdout)),
         heldout_s=float(sum(e.time_s[-1] - e.time_s[0] for e in holdout)),
-        tick_s=episodes[0].step_s if episodes else None,
+        tick_s=max((e.step_s for e in episodes), default=None),
         telemetry=tuple(telemetry),
         left_out=tuple(left_out),
     )
@@ -257,7 +258,8 @@ def _residuals(
 ) -> tuple[list[Residuals], list[ResidualOver]]:
     centre = Members(result.estimate[None], np.array([result.latency_s]))
     M = len(problem.channels)
-    length = max(min(samples_in(problem, WHITENED_S), WHITENED_SIZE // M), 2)
+    faster = problem.period_s / min(e.period_s for e in problem.episodes)
+    length = max(min(samples_in(problem, WHITENED_S), int(WHITENED_SIZE // M / faster)), 2)
     found = []
     try:
         windows = problem.windows(length)

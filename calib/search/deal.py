@@ -42,9 +42,10 @@ from deal_hw.calib.data.innovations import (
     predict_population,
     samples_per_tick,
 )
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.resume import Stateful
 from deal_hw.calib.data.search import Search, SearchLog
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.paper.critic import FEATURE_CRITIC, CriticSettings, PenaltyCritic, Samples
 from deal_hw.calib.search.eki import NEAR_SPREAD, KalmanStepper, spread_of
 from deal_hw.calibration import CalibrationResult

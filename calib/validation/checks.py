@@ -103,7 +103,7 @@ def unexplained(refined: Refined, longest: float = CORRELATION_SAMPLES, chance: 
         return False
     if refined.chi2 > MISMATCH_CHI2:
         return True
-    return correlation_time(refined.normal.residual, chance) > longest
+    return correlation_time(refined.normal.residual, chance, refined.normal.periods_s) > longest
 
 
 def doubtful(refined: Refined) -> bool:
@@ -220,7 +220,7 @@ def judge(
         cluster = known.clustered
         facts["clustered"] = {
             "blocks": cluster.blocks,
-            "block_s": cluster.block_samples * problem.episodes[0].period_s,
+            "block_s": cluster.block_windows * refined.shooting.length * problem.period_s,
             "variance_ratio": dict(zip(problem.space.names, map(float, cluster.ratio), strict=False)),
             "widened": dict(zip(problem.space.names, map(float, known.widened), strict=True)),
         }
@@ -305,7 +305,7 @@ def biased(problem: Problem, known: Uncertainty, causes: Sequence[Diagnosis]) ->
     if problem.fixed_latency_s is not None or not total[-1]:
         return known
     (first, last), (low, high) = problem.latency_range_s, known.latency_interval_s
-    if total[-1] > max((high - low) / 2, 0.5 * problem.episodes[0].step_s):
+    if total[-1] > max((high - low) / 2, 0.5 * problem.step_s):
         marks[LATENCY] = causes[int(np.argmax([shift[-1] for shift in shifts]))].code
     wider = (max(low - total[-1], first), min(high + total[-1], last))
     return dataclasses.replace(known, latency_interval_s=wider, biased=marks)
@@ -413,7 +413,7 @@ def check_split_half(
     if known.clustered is not None:
         # Blocks as long as residuals are correlated, but at least two blocks in each half.
         longest = windows // FEWEST_WINDOWS
-        block = max(1, min(round(known.clustered.block_samples / shooting.length), longest))
+        block = max(1, min(round(known.clustered.block_windows), longest))
     latency_s = None if shooting.fixed_latency else refined.latency_s
     fits, halves = [], []
     for half in range(2):
@@ -497,7 +497,7 @@ def half_of(refined: Refined, half: int, block: int) -> Refined:
     The count of windows continues over recordings.
     """
     shooting, point, normal = refined.shooting, refined.point, refined.normal
-    data, position, velocity, residual, back, rows = [], [], [], [], [], []
+    data, position, velocity, residual, back, rows, periods_s = [], [], [], [], [], [], []
     first, count = 0, 0
     for e, of_episode in enumerate(shooting.data):
         number = (first + np.arange(len(of_episode.windows))) // block
@@ -509,6 +509,7 @@ def half_of(refined: Refined, half: int, block: int) -> Refined:
         position.append(point.position[e][mine])
         velocity.append(point.velocity[e][mine])
         residual.append(normal.residual[e][mine])
+        periods_s.append(normal.periods_s[e])
         gain, shift = normal.back[e]
         back.append((gain[mine], shift[mine]))
         whole = normal.rows[e]
@@ -518,13 +519,14 @@ def half_of(refined: Refined, half: int, block: int) -> Refined:
     there = Point(point.value, tuple(position), tuple(velocity))
     cost = float(normal.prior @ (point.value - shooting.prior_mean) ** 2)
     cost += sum(float(np.sum(r.residual**2)) for r in rows)
-    kept = dataclasses.replace(normal, cost=cost, count=count, residual=tuple(residual), back=tuple(back))
+    left = dataclasses.replace(normal, residual=tuple(residual), back=tuple(back), periods_s=tuple(periods_s))
+    kept = dataclasses.replace(left, cost=cost, count=count)
     return refined_at(part, there, of_rows(part, there, kept, tuple(rows)))
 
 
 def _steps(problem: Problem, shooting: Shooting) -> float:
     """Return the most physics steps that the comparison takes."""
-    substeps = problem.episodes[0].step_s / problem.robot.step_s
+    periods = shooting.seconds / problem.robot.step_s
     # One normal matrix and one line of damped steps per iteration.
     members = 2 + len(problem.space) + 2 * problem.coordinates + 10
-    return float(HALF_ITERATIONS * members * shooting.device_periods * substeps)
+    return float(HALF_ITERATIONS * members * periods)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from deal_hw.calib.data.parts import samples_in
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.refinement import at_parameters
 from deal_hw.calib.hypotheses.recording_zeros import fitted_zeros, with_other_zeros, zeros_of
 from deal_hw.parameters import ParameterSpace

@@ -88,7 +88,7 @@ def scan_latency(problem: Problem, refined: Refined, progress: ProgressCallback 
     other parameters; the ticks that remain plausible show by how much. Where the recordings put the latency
     between two ticks, as with commands that come at any time, no tick is worth a fit, and there is no scan.
     """
-    tick = problem.episodes[0].step_s
+    tick = problem.step_s
     centre = round(refined.latency_s / tick)
     low, high = (round(v / tick) for v in problem.latency_range_s)
     contacts = problem.robot.base is not None
@@ -142,7 +142,7 @@ def _latency_step(refined: Refined, latency_s: float) -> FloatArray:
 
 def averaged(problem: Problem, scan: LatencyScan, best: Uncertainty) -> Uncertainty:
     """Widen the uncertainty at the best latency by the spread over the plausible latencies."""
-    space, tick = best.space, problem.episodes[0].step_s
+    space, tick = best.space, problem.step_s
     center = space.to_scale(best.theta)
     covariance = np.zeros_like(best.covariance)
     for weight, refined in zip(scan.weights, scan.refined, strict=True):
@@ -213,7 +213,7 @@ def check_step(problem: Problem, refined: Refined, most_steps: float = MOST_STEP
         # A contact at another moment changes a prediction more than the step's error does.
         return StepCheck(step_s, note="not compared for robots in contact")
     shooting, rows = refined.shooting, refined.normal.rows
-    steps = 3.0 * shooting.device_periods * problem.episodes[0].step_s / step_s
+    steps = 3.0 * shooting.seconds / step_s
     if steps > most_steps:
         return StepCheck(step_s, note=f"not compared: it would take {steps:.1g} physics steps")
     finer = Shooting(halved(problem), shooting.length, data=shooting.data)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,9 +20,11 @@ from deal_hw.workflows.robot_recordings import at_recorded_rates, derived_robot
 from deal_hw.workflows.say import Say, silent
 
 if TYPE_CHECKING:
+    from deal_hw.data.importing.grid import Recording
     from deal_hw.data.recording.dataset import Dataset
     from deal_hw.data.recording.reader import Episode
     from deal_hw.sim.mjcf.joint_facts import JointFacts
+    from deal_hw.types import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +93,7 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     from deal_hw.data.checks.following import followed_part
     from deal_hw.data.importing.channels import digest_of_file
     from deal_hw.data.importing.columns import ColumnMap, read_column_map
-    from deal_hw.data.importing.grid import common_period, to_trajectories
+    from deal_hw.data.importing.grid import grid_periods, to_trajectories
     from deal_hw.data.importing.load import MapOf, load_tables
     from deal_hw.data.importing.store import minimal_description, write_dataset
     from deal_hw.data.recording.dataset_index import entry_of_episode
@@ -136,8 +138,10 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         table.name: [verdict_json(v) for v in examine_recording(table, facts, config.force, say=say)]
         for table in checked
     }
+    periods, kept_rates = grid_periods(checked), {} if episodes else _kept_rates(config.out, say)
     if robot is None and described is None and config.model is not None:
-        robot = derived_robot(config.model, config.name, tables)
+        rate_hz = kept_rates.get("control_rate_hz", 1 / max(periods))
+        robot = derived_robot(config.model, config.name, tables, rate_hz)
     elif facts is None and described is None and not is_ours(config.name or config.paths[0].stem):
         say(
             "no model is given, so `calibrate` and `inspect` cannot use the dataset: add --model robot.xml "
@@ -148,20 +152,16 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
             f"{name}: base_position and base_velocity are not kept, as a dataset holds no place of a base. "
             "To use them: deal-hw calibrate --model robot.xml --data FILE --columns columns.yaml"
         )
-    period = common_period(checked)
     if robot is None:
-        recordings = [part for table in tables for part in to_trajectories(table, period_s=period)]
+        each = zip(tables, periods[len(episodes) :], strict=True)
+        recordings = [part for table, own in each for part in to_trajectories(table, period_s=own)]
     else:
         simulated, rates = at_recorded_rates(robot, tables, config.device_periods)
-        recordings = [part for table in tables for part in on_grid(table, simulated, rates)]
+        pairs = zip(tables, rates, strict=True)
+        recordings = [part for table, own in pairs for part in on_grid(table, simulated, own)]
         described = simulated.description.to_json()
-    for part in recordings:
-        how = part.trajectory.metadata["import"]
-        stretch = f", stretch {how['stretch'] + 1} of {how['stretches']}" if how["stretches"] > 1 else ""
-        say(
-            f"{how['file']}{stretch}: {part.trajectory.duration_s:.4g} s at {1 / period:.6g} Hz, samples "
-            f"{how['method']}, largest shift {how['largest_shift_s'] * 1e3:.3f} ms"
-        )
+    for line in _placed(recordings):
+        say(line)
     # The source of each new episode, as it is noted in the dataset.
     sources = [_source(e.path.name, digest_of_file(e.path)) for e in episodes]
     sources += [_source(**part.trajectory.metadata["import"]) for part in recordings]
@@ -172,10 +172,11 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
         recordings,
         config.name or (config.model or config.paths[0]).stem,
         tables[0].units,
-        1 / period,
+        1 / max(periods),
         mjcf=config.model,
         rates_per_sample=config.device_periods,
     )
+    values = {**values, **kept_rates}
     if robot is not None:
         from deal_hw.data.recording.dataset import Dataset
         from deal_hw.sim.robots.dataset_robot import store_robot
@@ -189,6 +190,38 @@ def import_recordings(config: ImportSettings, say: Say = silent) -> Dataset | No
     known += [{} for _ in recordings]
     noted = [{**of, "plausibility": problems, "source": s} for of, s in zip(known, sources, strict=True)]
     return write_dataset(config.out, recordings, values, noted, say, [e.path for e in episodes])
+
+
+RATES = ("control_rate_hz", "device_rate_hz", "state_rate_hz")
+"""Entries of a description that an imported episode need not have: it has a grid of its own."""
+
+
+def _kept_rates(folder: Path, say: Say) -> dict[str, float]:
+    """Return the rates that the description of an existing dataset has; none of a new one."""
+    from deal_hw.data.recording.dataset import Dataset
+
+    if not (folder / INDEX_NAME).is_file():
+        return {}
+    kept = Dataset.open(folder, say).description
+    return {name: float(kept[name]) for name in RATES}
+
+
+def _placed(recordings: Sequence[Recording]) -> Iterator[str]:
+    """Yield how each recording was put on its grid, with all of its parts in one line."""
+    parts: dict[tuple[str, str], list[Trajectory]] = {}
+    for recording in recordings:
+        how = recording.trajectory.metadata["import"]
+        parts.setdefault((how["file"], how["part"]), []).append(recording.trajectory)
+    for (file, part), trajectories in parts.items():
+        hows = [t.metadata["import"] for t in trajectories]
+        many = f"{len(trajectories)} parts between pauses, " if len(trajectories) > 1 else ""
+        seconds, shift_s = sum(t.duration_s for t in trajectories), max(h["largest_shift_s"] for h in hows)
+        rate_hz, kept = 1 / hows[0]["period_s"], " and ".join(sorted({h["method"] for h in hows}))
+        name = f"{file} {part}".strip()
+        yield (
+            f"{name}: {many}{seconds:.4g} s at {rate_hz:.6g} Hz, samples {kept}, largest shift "
+            f"{shift_s * 1e3:.3f} ms"
+        )
 
 
 def _source(file: str, sha256: str, part: str = "", stretch: int = 0, **_: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deal_hw.errors import ConfigurationError
-from deal_hw.workflows.calibration.recordings import common_rates
+from deal_hw.workflows.calibration.recordings import recorded_rates
 from deal_hw.workflows.robot import is_ours
 
 if TYPE_CHECKING:
@@ -18,24 +18,23 @@ if TYPE_CHECKING:
     from deal_hw.sim.robots.user_robot import UserRobot
 
 
-def derived_robot(model: Path, name: str, tables: Sequence[Table]) -> UserRobot | None:
+def derived_robot(model: Path, name: str, tables: Sequence[Table], rate_hz: float) -> UserRobot | None:
     """Return the robot that a model describes; None for a robot of deal-hw, which is known by its name.
 
     Args:
         model: The MJCF.
         name: The robot's name; "": the file's name.
         tables: Its recordings.
+        rate_hz: Its commands a second.
 
     Raises:
         ConfigurationError: `inspect` and `calibrate` could not use it.
     """
-    from deal_hw.data.importing.grid import common_period
     from deal_hw.sim.mjcf.urdf import require_drives
     from deal_hw.sim.robots.user_robot import derive_robot
 
     if is_ours(name or model.stem):
         return None
-    rate_hz = 1 / common_period(tables)
     try:
         read = {joint for table in tables for joint in table.joint_names}
         robot = derive_robot(model, name=name, control_rate_hz=rate_hz, several_trees=True, recorded=read)
@@ -74,8 +73,8 @@ def _check_joints(robot: UserRobot, table: Table) -> None:
 
 def at_recorded_rates(
     robot: UserRobot, tables: Sequence[Table], device_periods: int = 1
-) -> tuple[RobotModel, Sampling]:
-    """Return the robot's model at the recordings' rates, and the rates.
+) -> tuple[RobotModel, list[Sampling]]:
+    """Return the robot's model at the slowest recordings' rates, and the rates of each.
 
     Args:
         robot: The robot.
@@ -86,12 +85,13 @@ def at_recorded_rates(
         ConfigurationError: The recordings have other joints than the robot.
     """
     from deal_hw.sim.engine.model import load_model
-    from deal_hw.sim.mjcf.describe import WINDOW_TICKS
+    from deal_hw.sim.mjcf.describe import WINDOW_TICKS, slowest
 
     for table in tables:
         _check_joints(robot, table)
     own = robot.rates
-    rates = common_rates(tables, robot.model, None, own.period_s * own.samples_per_tick * WINDOW_TICKS)
+    rates = recorded_rates(tables, robot.model, None, own.period_s * own.samples_per_tick * WINDOW_TICKS)
     if device_periods > 1:
-        rates = dataclasses.replace(rates, substeps=device_periods)
-    return load_model(robot.description(rates), rates.step_s), rates
+        rates = [dataclasses.replace(each, substeps=device_periods) for each in rates]
+    described = slowest(rates)
+    return load_model(robot.description(described), described.step_s), rates

@@ -27,7 +27,7 @@ def _rows(residual: FloatArray, design: FloatArray, start: FloatArray | None = N
 def test_ratio_of_a_mean_by_hand() -> None:
     """Eight windows of one sample around a mean: the ratio is the sample variance, sum of squares over 7."""
     values = np.array([1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 0.5, -0.5])
-    found = clustered([_rows(values[:, None], np.ones((8, 1, 1)))], np.array([[1 / 8]]), 1)
+    found = clustered([_rows(values[:, None], np.ones((8, 1, 1)))], np.array([[1 / 8]]), [1])
     assert found is not None and found.blocks == 8
     assert found.ratio[0] == pytest.approx(np.sum(values**2) / 7)
     assert found.degrees[0] == pytest.approx(8.0)
@@ -37,10 +37,10 @@ def test_ratio_with_errors_shared_inside_windows_by_hand() -> None:
     """Errors that are equal inside windows of four samples: variance of the mean is 4 times the naive one."""
     shared = np.array([1.0, -1.0] * 12)
     residual = np.repeat(shared[:, None], 4, axis=1)
-    found = clustered([_rows(residual, np.ones((24, 4, 1)))], np.array([[1 / 96]]), 4)
+    found = clustered([_rows(residual, np.ones((24, 4, 1)))], np.array([[1 / 96]]), [4])
     # A score is 4 times the error, 16 each; white noise gives 4 (1 - 4 / 96) each.
     assert found is not None
-    assert found.block_samples == 4
+    assert found.block_windows == 1
     assert found.ratio[0] == pytest.approx(16 / (4 * (1 - 4 / 96)))
 
 
@@ -60,23 +60,23 @@ def test_cluster_robust_covariance_equals_the_textbook_up_to_its_small_sample_fa
     for w in range(30):
         mine = slice(10 * w, 10 * w + 10)
         white += flat[mine].T @ noise[mine, mine] @ flat[mine]
-    found = clustered([_rows(left, design)], bread, 10)
-    assert found is not None and found.block_samples == 10
+    found = clustered([_rows(left, design)], bread, [10])
+    assert found is not None and found.block_windows == 1
     assert found.ratio == pytest.approx(np.diag(textbook) / np.diag(bread @ white @ bread))
 
 
 def test_too_few_blocks_say_nothing() -> None:
     """Seven windows of one sample are not clustered; nor are none."""
-    assert clustered([_rows(np.ones((7, 1)), np.ones((7, 1, 1)))], np.array([[1 / 7]]), 1) is None
-    assert clustered([], np.eye(1), 1) is None
+    assert clustered([_rows(np.ones((7, 1)), np.ones((7, 1, 1)))], np.array([[1 / 7]]), [1]) is None
+    assert clustered([], np.eye(1), []) is None
 
 
 def test_blocks_grow_while_neighbours_hang_together() -> None:
     """Errors shared by four neighbouring windows of 64 end in blocks of at least four windows."""
     rng = np.random.default_rng(1)
     residual = np.repeat(rng.normal(size=(64, 1)), 4, axis=0) * np.ones((256, 5))
-    found = clustered([_rows(residual - residual.mean(), np.ones((256, 5, 1)))], np.array([[1 / 1280]]), 5)
-    assert found is not None and found.block_samples >= 20
+    found = clustered([_rows(residual - residual.mean(), np.ones((256, 5, 1)))], np.array([[1 / 1280]]), [5])
+    assert found is not None and found.block_windows >= 4
 
 
 def test_start_states_are_eliminated() -> None:
@@ -99,7 +99,7 @@ def test_offsets_of_windows_do_not_bias_the_ratio_of_parts_of_windows() -> None:
         y = rng.normal(size=(4, 40))
         left = y - y.mean(axis=1, keepdims=True)
         left = left - effective @ (bread @ np.einsum("whp,wh->p", effective, left))
-        found = clustered([_rows(left, design, start)], bread, 40)
+        found = clustered([_rows(left, design, start)], bread, [40])
         assert found is not None
         ratios.append(found.ratio)
         blocks = found.blocks

@@ -13,8 +13,9 @@ from fakes.small_runs import small_run
 from deal_hw import calibrate
 from deal_hw.bench.tasks import Case, make_case
 from deal_hw.calib.data.parts import taken
-from deal_hw.calib.data.problem import CommandDelays, Problem, WindowData
+from deal_hw.calib.data.problem import CommandDelays, Problem
 from deal_hw.calib.data.resume import Restarts
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit import command_delays as command_delays_module
 from deal_hw.calib.fit.command_delays import (
     FreeRows,

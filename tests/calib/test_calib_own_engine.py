@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from deal_hw.calib.api import OwnResidual, Problem, Shooting, SolverSettings, minimise, value_bounds
-from deal_hw.calib.data.problem import WindowData
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.types import FloatArray
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "own-calibration-engine.md"

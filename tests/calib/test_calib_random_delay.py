@@ -40,7 +40,7 @@ def _pushed(
         np.concatenate([np.ones((WINDOWS, SAMPLES, 1)), np.full((WINDOWS, 1, 1), 1e-3)], axis=1),
     )
     response = np.broadcast_to(answer, (1, WINDOWS, SAMPLES))[..., None]
-    return SeenErrors([rows], [SignatureResponse(response, change[..., None])], PERIOD_S)
+    return SeenErrors([rows], [SignatureResponse(response, change[..., None])], [PERIOD_S])
 
 
 def test_random_delays_push_where_commands_change() -> None:
@@ -62,7 +62,7 @@ def test_few_windows_end_in_an_answer_or_none(windows: int) -> None:
     answers = dataclasses.replace(
         answer, response=answer.response[:, :windows], change=answer.change[:windows]
     )
-    found = random_delay(SeenErrors([few], [answers], PERIOD_S))
+    found = random_delay(SeenErrors([few], [answers], [PERIOD_S]))
     assert (found is None) == (windows < FEWEST_WINDOWS)
 
 
@@ -122,7 +122,7 @@ def test_a_command_is_late_for_all_actuators(name: Process) -> None:
         both = SignatureResponse(
             np.concatenate([answer.response, second * answer.response]), np.repeat(answer.change, 2, axis=2)
         )
-        two = SeenErrors(seen.rows, [both], PERIOD_S)
+        two = SeenErrors(seen.rows, [both], [PERIOD_S])
         windows = [ErrorWindow.of(two, 0, w, np.ones(2), None) for w in range(WINDOWS)]
         variances.append(Covariance.of(windows, name).intensity)
     one, alike, against = variances

@@ -10,7 +10,8 @@ from fakes.knee_evidence import PERIOD_S, SAMPLES, WINDOWS
 from fakes.small_runs import small_run
 
 from deal_hw.calib.data.noise import NoiseModel
-from deal_hw.calib.data.problem import Problem, WindowData
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2, jitter_alarm, uncertainty_at, with_rows
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.fit.residual import Shooting, WindowRows
@@ -62,7 +63,7 @@ def _pushed(force: float, seed: int, hertz: float = 0.7) -> tuple[SeenErrors, fl
         np.concatenate([np.ones((WINDOWS, SAMPLES, 1)), np.full((WINDOWS, 1, 1), 1e-3)], axis=1),
     )
     response = np.broadcast_to(_moved(np.eye(1, SAMPLES))[0], (1, WINDOWS, SAMPLES))[..., None]
-    seen = SeenErrors([rows], [SignatureResponse(response, change[..., None])], PERIOD_S)
+    seen = SeenErrors([rows], [SignatureResponse(response, change[..., None])], [PERIOD_S])
     return seen, off * float(np.sqrt(np.sum(free**2)))
 
 

@@ -182,7 +182,31 @@ def test_one_pause_is_judged_by_whose_recording_it_is(make_trajectory: MakeTraje
     paused = cut(make_trajectory(), (number < 400) | (number >= 419))
     ours, others = verdict(paused, "gaps"), {f.code: f for f in examine(table_of(paused))}["gaps"]
     assert (ours.severity, others.severity) == (Severity.FAIL, Severity.WARN)
-    assert ours.seen.startswith(others.seen) and others.do == "the recording is split there"
+    assert ours.seen.startswith("1 gaps, the longest 100 ms")
+    assert others.seen == "2 parts; the pause between them is not fitted (100 ms)" and not others.do
+
+
+def test_roll_outs_are_parts_and_a_logger_that_loses_samples_fails(make_trajectory: MakeTrajectory) -> None:
+    """Pauses of seconds between parts are no fault; parts too short for a window are, if they are many."""
+    table, number = table_of(make_trajectory()), np.arange(800)
+    roll_outs = replace(table, time_s=table.time_s + 3.0 * (number // 200))
+    found = {f.code: f for f in examine(roll_outs)}
+    assert found["gaps"].severity is Severity.WARN
+    assert found["gaps"].seen == "4 parts; 3 pauses between them are not fitted (the longest 3 s)"
+    # Nothing was measured in a pause, so nothing stood still in it.
+    assert found["frozen"].severity is Severity.OK
+    torn = replace(table, time_s=table.time_s + 0.1 * (number // 30))
+    lost = {f.code: f for f in examine(torn)}["gaps"]
+    assert lost.severity is Severity.FAIL and "27 parts are shorter than 0.2 s" in lost.message
+
+
+def test_short_files_of_others_are_used(make_trajectory: MakeTrajectory) -> None:
+    """0.8 s of a log are used, an episode that was imported from one, too; 0.15 s are not."""
+    short = cut(make_trajectory(), np.arange(800) < 161)
+    assert {f.code: f for f in examine(table_of(short))}["rate"].severity is Severity.OK
+    assert verdict(replace(short, metadata={"import": {"period_s": 0.005}}), "length").severity is Severity.OK
+    less = table_of(cut(make_trajectory(), np.arange(800) < 31))
+    assert "at least 0.2 s" in {f.code: f for f in examine(less)}["rate"].message
 
 
 @pytest.mark.parametrize("channel", ["position", "velocity", "effort"])

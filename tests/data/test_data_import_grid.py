@@ -11,7 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deal_hw.data.importing.grid import Gains, common_period, period_of, to_trajectories
+from deal_hw.data.importing.grid import (
+    Gains,
+    common_period,
+    grid_periods,
+    period_of,
+    to_trajectories,
+    unevenness_s,
+)
 from deal_hw.data.importing.load import own_episodes
 from deal_hw.data.importing.store import write_dataset
 from deal_hw.data.recording.reader import read_trajectory
@@ -188,6 +195,55 @@ def test_two_recordings_share_one_grid(make_table: MakeTable) -> None:
         (part,) = to_trajectories(table, GAINS, period)
         np.testing.assert_allclose(part.trajectory.device_s, np.arange(1200) * period, rtol=1e-12)
         np.testing.assert_array_equal(part.trajectory.position, table.position)
+
+
+def at_rate(make_table: MakeTable, rate_hz: float) -> Table:
+    """Return the 1200 samples of the table at another rate."""
+    time_s = np.arange(1200) / rate_hz
+    return make_table(time_s=time_s, command_s=time_s)
+
+
+@pytest.mark.parametrize(
+    ("rates_hz", "shared"),
+    [
+        ((193.0, 70.0, 199.0), ((0,), (1,), (2,))),
+        ((200.0, 199.0, 200.01), ((0, 2), (1,))),
+        ((100.0, 100.02, 99.99), ((0, 1, 2),)),
+        ((50.0, 500.0, 62.5, 50.004, 499.9), ((0, 3), (1, 4), (2,))),
+    ],
+)
+def test_each_rate_has_a_grid_of_its_own(
+    make_table: MakeTable, rates_hz: tuple[float, ...], shared: tuple[tuple[int, ...], ...]
+) -> None:
+    """Recordings share a grid if their clocks agree to a thousandth; all others have their own."""
+    tables = [at_rate(make_table, rate_hz) for rate_hz in rates_hz]
+    periods = grid_periods(tables)
+    for rows in shared:
+        assert {periods[i] for i in rows} == {float(np.median([period_of(tables[i]) for i in rows]))}
+    assert len(set(periods)) == len(shared)
+
+
+def test_short_recordings_with_jitter_share_a_grid(make_table: MakeTable) -> None:
+    """The rate of 80 samples whose ends are 2 ms off is 2.5 parts in 1000 off; none moves half a period."""
+    first = np.arange(80) * 0.01
+    late = first.copy()
+    late[-1] += 0.002
+    tables = [
+        make_table(
+            time_s=t, command_s=t, **{n: getattr(make_table(), n)[:80] for n in ("position", "target")}
+        )
+        for t in (first, late)
+    ]
+    assert len(set(grid_periods(tables))) == 1
+
+
+def test_how_uneven_a_clock_is(make_table: MakeTable) -> None:
+    """A sine of 0.2 ms on the stamps is found; another rate, and the pauses of roll-outs, are none."""
+    even = at_rate(make_table, 70.0)
+    paused = dataclasses.replace(even, time_s=even.time_s + 2.003 * (np.arange(1200) // 200))
+    wave = dataclasses.replace(even, time_s=even.time_s + 2e-4 * np.sin(np.arange(1200) / 7))
+    assert unevenness_s(even) < 1e-9 and unevenness_s(paused) < 1e-9
+    assert unevenness_s(wave) == pytest.approx(2e-4, rel=0.05)
 
 
 @settings(max_examples=40, deadline=None)

@@ -12,9 +12,21 @@ import numpy as np
 import pytest
 
 import deal_hw
-from deal_hw.errors import ConfigurationError, DatasetError, DealHwError, PolicyError, UnknownNameError
+from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.pipeline.methods import with_rates
+from deal_hw.errors import (
+    ConfigurationError,
+    DatasetError,
+    DealHwError,
+    InsufficientDataError,
+    PolicyError,
+    UnknownNameError,
+)
+from deal_hw.sim.mjcf.describe import Sampling
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
+from deal_hw.workflows.calibration.intake import calibration_input
+from deal_hw.workflows.calibration.recordings import one_rate
 from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.calibration.space import searched_space
 
@@ -123,7 +135,7 @@ def test_models_in_memory(pendulum: tuple[Path, Path, Path], tmp_path: Path) -> 
         ),
         (
             [{"time": T, "position": np.zeros((1, 400)), "target": np.zeros((1, 400))}],
-            r"data\[0\]\['position'\] has shape \(1, 400\), but there are 400 times; .* its transpose",
+            r"data\[0\]: 'position' has shape \(1, 400\), but there are 400 times; .* its transpose",
         ),
         (
             [{"time": T, "position": np.zeros((400, 3)), "target": np.zeros((400, 3))}],
@@ -268,3 +280,157 @@ def test_an_engine_is_chosen_before_the_run(
     else:
         run()
         assert any(words in line for line in said)
+
+
+TRUE = {"armature": 0.02, "damping": 0.3, "frictionloss": 0.05, "kp": 12.0, "kv": 0.6}
+OWNERS = {"armature": 0.03, "damping": 0.3, "frictionloss": 0.08, "kp": 9.0, "kv": 0.9}
+
+
+def servo(values: dict[str, float]) -> str:
+    """Return a pendulum with a position servo, in plain MuJoCo."""
+    return (
+        '<mujoco model="servo"><option timestep="0.002"/><worldbody><body name="link" pos="0 0 1">'
+        '<joint name="knee" axis="0 1 0" armature="{armature}" damping="{damping}" '
+        'frictionloss="{frictionloss}"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".8" '
+        'contype="0" conaffinity="0"/></body></worldbody><actuator><position name="motor" joint="knee" '
+        'kp="{kp}" kv="{kv}"/></actuator></mujoco>'
+    ).format(**values)
+
+
+def swing(rate_hz: float, seconds: float, seed: int) -> Arrays:
+    """Return a recording of the true pendulum: samples and commands at a rate, 0.5 mrad of noise."""
+    model = mujoco.MjModel.from_xml_string(servo(TRUE))
+    substeps = max(round(1 / rate_hz / model.opt.timestep), 1)
+    model.opt.timestep = 1 / rate_hz / substeps
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    time_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    hertz, phase = rng.uniform(0.4, 2.0, 3), rng.uniform(0, 6, 3)
+    command = 0.35 * np.sin(2 * np.pi * hertz * time_s[:, None] + phase).sum(axis=1)
+    position = np.empty(len(time_s))
+    for k, target in enumerate(command):
+        position[k] = data.qpos[0] + rng.normal(0, 5e-4)
+        data.ctrl[0] = target
+        mujoco.mj_step(model, data, substeps)
+    return {"time": time_s, "knee_pos": position, "knee_cmd": command}
+
+
+def roll_outs(rate_hz: float, count: int, seed: int) -> Arrays:
+    """Return recordings of 0.7 to 1.5 s in one, with pauses of 0.1 to 4 s between them."""
+    rng, parts, begin_s = np.random.default_rng(seed), list[Arrays](), 0.0
+    for k in range(count):
+        part = swing(rate_hz, rng.uniform(0.7, 1.5), 100 * seed + k)
+        part["time"] = part["time"] + begin_s
+        begin_s = part["time"][-1] + rng.uniform(0.1, 4.0)
+        parts.append(part)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+@pytest.fixture(scope="module")
+def owners(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The model of the pendulum's owner, with another gain, damping, friction and armature."""
+    path = tmp_path_factory.mktemp("servo") / "servo.xml"
+    path.write_text(servo(OWNERS))
+    return path
+
+
+def test_rates_and_roll_outs_fit_together(owners: Path) -> None:
+    """Two rates and roll-outs give one result: each true value in its 90 % interval and within 6 %.
+
+    The noise alone moves the least certain one, the friction, by about 2 %. The link's mass is known, which
+    sets the scale of all forces. A recording of another rate judges.
+    """
+    said: list[str] = []
+    found = deal_hw.calibrate(
+        owners,
+        [swing(193.0, 4.0, 11), swing(70.0, 4.0, 12), roll_outs(100.0, 8, 13)],
+        holdout=[swing(50.0, 3.0, 14)],
+        known={"link.mass": 0.8},
+        threads=1,
+        say=said.append,
+    )
+    assert found.colour == "green"
+    rows = {row["parameter"]: row for row in found.rows()}
+    for name, true in (
+        ("knee.armature", TRUE["armature"]),
+        ("knee.frictionloss", TRUE["frictionloss"]),
+        ("motor.servo_stiffness", TRUE["kp"]),
+        ("motor.servo_damping", TRUE["kv"]),
+    ):
+        assert rows[name]["low"] <= true <= rows[name]["high"], name
+        assert rows[name]["estimate"] == pytest.approx(true, rel=0.06), name
+    assert found.result.provenance["rates_hz"] == pytest.approx([50.0, 70.0, 100.0, 193.0])
+    assert sum("4 rates: " in line for line in said) == 1
+    assert sum("8 parts; 7 pauses between them are not fitted" in line for line in said) == 1
+    assert found.result.heldout_nrmse["calibrated"] < 0.1 * found.result.heldout_nrmse["nominal"]
+
+
+def settings_of(owners: Path, *data: Arrays, **more: Any) -> FilesSettings:
+    """Return settings of recordings in memory."""
+    return FilesSettings(model=owners, data=data, threads=1, **more)
+
+
+def test_windows_last_equally_long_at_all_rates(owners: Path) -> None:
+    """Windows of 20 samples at 50 Hz have 40 at 100 and 200 at 500 Hz; each is simulated on its own grid."""
+    every = [swing(rate_hz, 3.0, 5) for rate_hz in (500.0, 50.0, 100.0)]
+    work = calibration_input(settings_of(owners, *every, holdout_part=0.0))
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    assert problem.period_s == pytest.approx(0.02) and problem.rates == 3
+    lengths = {e.period_s: 0 for e in problem.episodes}
+    for data in problem.windows(20):
+        lengths[problem.episodes[data.episode].period_s] = data.windows.length
+        episode = problem.episodes[data.episode]
+        assert problem.batch(1, data.episode).robot.step_s == pytest.approx(episode.step_s)
+        start = data.windows.start[0], data.windows.start[0] + data.windows.length
+        assert np.ptp(episode.time_s[list(start)]) == pytest.approx(0.4)
+    assert {round(1 / period_s): n for period_s, n in lengths.items()} == {500: 200, 50: 20, 100: 40}
+    theta = problem.space.nominal[None]
+    errors = [
+        np.std(problem.predict(theta, np.zeros(1), data).observed[0] - data.measured)
+        for data in problem.windows(5)
+    ]
+    # The owner's values err by as much in recordings of the same motion, whatever their rate.
+    assert max(errors) < 1.5 * min(errors)
+
+
+def test_a_short_recording_is_one_window_beside_longer_ones(owners: Path) -> None:
+    """Windows of 1 s: a recording of 0.8 s is not left out; without a longer one there is no such window."""
+    long, short = swing(100.0, 3.0, 6), swing(100.0, 0.8, 7)
+    work = calibration_input(settings_of(owners, long, short, holdout_part=0.0))
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    lengths = [data.windows.length for data in problem.windows(100)]
+    assert lengths[0] == 100 and lengths[-1] == 79
+    assert len(problem.windows(100, shorter=False)) == len(lengths) - 1
+    alone = problem.on([problem.episodes[-1]], None)
+    with pytest.raises(InsufficientDataError, match=r"1\.00 s"):
+        alone.windows(100)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fitted", "held"), [([0.8], 1, 0), ([1.7], 1, 1), ([1.0] * 8, 6, 2), ([4.0], 2, 1)]
+)
+def test_what_of_short_recordings_is_held_out(
+    owners: Path, seconds: list[float], fitted: int, held: int
+) -> None:
+    """A quarter of each; of eight short ones two as a whole; of one that is too short nothing."""
+    data = [swing(100.0, s, 20 + k) for k, s in enumerate(seconds)]
+    said: list[str] = []
+    work = calibration_input(settings_of(owners, *data), say=said.append)
+    assert (len(work.episodes), len(work.holdout)) == (fitted, held)
+    assert any("held out as a whole" in line for line in said) == (len(seconds) == 8)
+    assert any("no held-out error is known" in line for line in said) == (not held)
+
+
+def test_a_policy_in_the_loop_needs_one_rate() -> None:
+    """Its simulators have one control period."""
+    rates = [Sampling(period_s=1 / hz, substeps=5, samples_per_tick=2) for hz in (100.0, 100.0, 70.0)]
+    assert one_rate(rates[:2]) is rates[0]
+    with pytest.raises(ConfigurationError, match=r"several rates \(70, 100 Hz\)"):
+        one_rate(rates)
+
+
+def test_a_search_for_several_rates() -> None:
+    """Pipelines search by `eki`; a search that compares sample with sample is refused alone."""
+    assert with_rates("default") == "default+eki" and with_rates("output-error") == "output-error+eki"
+    assert with_rates("local") == "local"
+    with pytest.raises(ConfigurationError, match="recordings of one rate"):
+        with_rates("deal")

@@ -70,7 +70,7 @@ def knee_evidence(wrong: FloatArray, columns: tuple[FloatArray, ...] = ()) -> Ev
         prior=np.full(parameter.shape[2], 1e-6),
         found=knee_signatures(),
         answers=(),
-        period_s=PERIOD_S,
+        periods_s=[PERIOD_S],
         time_s=[(np.arange(WINDOWS * SAMPLES, dtype=np.float64) * PERIOD_S).reshape(WINDOWS, SAMPLES)],
         names=["rec.csv"],
     )

@@ -104,7 +104,9 @@ def _correlate(table: Table) -> _Match | None:
 
 
 def _correlations(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the correlation of each column of x with each of y."""
+    """Return the correlation of each column of x with each of y; 0 without rows."""
+    if not len(x):
+        return np.zeros((x.shape[1], y.shape[1]))
     a, b = x - x.mean(axis=0), y - y.mean(axis=0)
     norm = np.linalg.norm(a, axis=0)[:, None] * np.linalg.norm(b, axis=0)[None]
     return np.asarray(a.T @ b / np.where(norm > 0, norm, np.inf))

@@ -19,7 +19,10 @@ from deal_hw.types import FloatArray
 FEWEST: Final = 3
 """With fewer samples there is no period, and nothing else can be checked."""
 SHORTEST_S: Final = 2.0
-"""Shortest recording [s]."""
+"""Shortest recording of our recorder [s]: it can be made again, and longer."""
+SHORTEST_PART_S: Final = 0.2
+"""Shortest recording of others, or part of one [s]: it holds a window of a fit. Whether it says enough of a
+parameter is judged by the fit."""
 MIN_RATE_HZ: Final = 20.0
 GOOD_RATE_HZ: Final = 50.0
 FROZEN_S: Final = 0.5
@@ -34,7 +37,7 @@ class RecordingLimits:
 
     shortest_s: float
     """Shortest recording [s]. The clock of others may have another unit, so there :func:`check_rate` judges
-    the duration."""
+    the duration of a file."""
 
     needed: tuple[str, ...]
     """Measured quantities without which a sample cannot be used. Our frames have both: one that is not a
@@ -59,7 +62,8 @@ class RecordingLimits:
     """A longer gap is a failure [s]: our recordings are used in one piece, those of others are split."""
 
     most_lost: float
-    """Largest share of the time that may lie in gaps. Our rule on the longest one is stricter."""
+    """Largest share of the samples that may lie in parts, between gaps, that are too short. Our rule on the
+    longest gap is stricter."""
 
     by_commands: bool
     """Whether a joint should move when its command does, or when other joints do. Our robots may rest, or be
@@ -111,7 +115,7 @@ OTHERS: Final = RecordingLimits(
     repair_values="a channel is broken, or one name has two rates",
     repair_stamps="the stamps are too coarse: record with finer ones",
     few_equal="the first of each is used",
-    repair_gaps="the recording is split there",
+    repair_gaps="check the logger: it loses samples",
 )
 
 
@@ -194,8 +198,8 @@ def check_rate(clock: FloatArray) -> Finding:
     text = f"{rate_hz:.4g} samples per second over {duration_s:.4g} s"
     if rate_hz > 20_000 or duration_s > 1e6:
         return Finding("rate", Severity.FAIL, text, "check the unit of time")
-    if duration_s < SHORTEST_S:
-        remedy = f"record at least {SHORTEST_S:g} s, and check the unit of time"
+    if duration_s < SHORTEST_PART_S:
+        remedy = f"record at least {SHORTEST_PART_S:g} s, and check the unit of time"
         return Finding("rate", Severity.FAIL, text, remedy)
     if rate_hz < MIN_RATE_HZ:
         return Finding(
@@ -214,6 +218,8 @@ def check_rate(clock: FloatArray) -> Finding:
 def check_gaps(clock: FloatArray, period_s: float, rules: RecordingLimits) -> Finding:
     """Check for pauses between samples.
 
+    Recordings that gaps split are used in parts, such as roll-outs in one file.
+
     Args:
         clock: Stamps of the samples, (T,) [s].
         period_s: Time between samples; 0: the median of the recording's steps [s].
@@ -225,17 +231,28 @@ def check_gaps(clock: FloatArray, period_s: float, rules: RecordingLimits) -> Fi
     if not gaps.size:
         longest_s = float(np.max(steps, initial=0.0))
         return Finding("gaps", Severity.OK, f"no gap; longest step {longest_s * 1e3:.4g} ms")
-    longest_s, lost = float(np.max(gaps)), float(np.sum(gaps) / np.sum(steps))
+    longest_s = float(np.max(gaps))
     length = f"{longest_s * 1e3:.4g} ms" if longest_s < 1 else f"{longest_s:.3g} s"
-    text = f"{gaps.size} gaps, the longest {length}; {lost:.1%} of the time"
-    if longest_s > max(rules.longest_gap_s, 2.5 * period_s):
-        text += f"; more than {rules.longest_gap_s * 1e3:g} ms is too long"
+    if rules.longest_gap_s < np.inf:
+        text = f"{gaps.size} gaps, the longest {length}; {np.sum(gaps) / np.sum(steps):.1%} of the time"
+        if longest_s > max(rules.longest_gap_s, 2.5 * period_s):
+            text += f"; more than {rules.longest_gap_s * 1e3:g} ms is too long"
+            return Finding("gaps", Severity.FAIL, text, rules.repair_gaps)
+        few = gaps.size <= rules.few_gaps * steps.size
+        return Finding("gaps", Severity.OK if few else Severity.WARN, text, "" if few else rules.repair_gaps)
+    parts = np.split(steps, np.flatnonzero(steps > rules.gap_periods * period_s))
+    # Each part but the first begins with the gap before it.
+    inside = [parts[0], *(part[1:] for part in parts[1:])]
+    samples = np.array([part.size + 1 for part in inside])
+    short = np.array([np.sum(part) < SHORTEST_PART_S for part in inside])
+    between = f"{gaps.size} pauses between them are not fitted (the longest {length})"
+    if gaps.size == 1:
+        between = f"the pause between them is not fitted ({length})"
+    text = f"{gaps.size + 1} parts; {between}"
+    if np.sum(samples[short]) > rules.most_lost * np.sum(samples):
+        text += f"; {np.count_nonzero(short)} parts are shorter than {SHORTEST_PART_S:g} s"
         return Finding("gaps", Severity.FAIL, text, rules.repair_gaps)
-    if lost > rules.most_lost:
-        return Finding("gaps", Severity.FAIL, text, rules.repair_gaps)
-    if gaps.size <= rules.few_gaps * steps.size:
-        return Finding("gaps", Severity.OK, text)
-    return Finding("gaps", Severity.WARN, text, rules.repair_gaps)
+    return Finding("gaps", Severity.WARN, text)
 
 
 def check_frozen(table: Table, rules: RecordingLimits) -> Finding:
@@ -315,7 +332,10 @@ def longest_still(time_s: FloatArray, position: FloatArray, moved: Callable[[int
     """
     changes = np.flatnonzero(position[1:] != position[:-1]) + 1
     edges = np.concatenate(([0], changes, [time_s.size - 1]))
-    spans_s = np.diff(time_s[edges])
+    # In a pause nothing was measured, so nothing stood still.
+    steps = np.diff(time_s)
+    steps[steps > OTHERS.gap_periods * np.median(steps)] = 0.0
+    spans_s = np.diff(np.concatenate(([0.0], np.cumsum(steps)))[edges])
     longest = 0.0
     for at in np.flatnonzero(spans_s > FROZEN_S):
         if spans_s[at] > longest and moved(int(edges[at]), int(edges[at + 1])):

@@ -58,7 +58,7 @@ def check(
     found = find_spikes(table.time_s, table.position, table.units, spikes)
     smooth = _without(table, found)
     return (
-        samples.check_length(table, OURS),
+        samples.check_length(table, OTHERS if "import" in trajectory.metadata else OURS),
         samples.check_finite(table, OURS),
         _check_clocks(table, trajectory),
         samples.check_gaps(table.time_s, nominal_period_s(trajectory), OURS),
@@ -157,7 +157,9 @@ def examine(
 
 
 def nominal_period_s(trajectory: Trajectory) -> float:
-    """Return the time between state samples by the robot's description; 0 if it has none [s]."""
+    """Return the time between state samples [s]: of its import, else by the robot's description, else 0."""
+    if period_s := trajectory.metadata.get("import", {}).get("period_s"):
+        return float(period_s)
     rate_hz = trajectory.metadata.get("description", {}).get("state_rate_hz")
     return 1.0 / rate_hz if rate_hz else 0.0
 

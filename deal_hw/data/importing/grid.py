@@ -17,6 +17,8 @@ from deal_hw.types import BaseTrajectory, BodyTrajectory, FloatArray, IntArray, 
 
 EVEN = 0.02
 """Steps between samples count as even if they differ from whole periods by at most this share."""
+CLOCKS = 1e-3
+"""Rates of one rig differ by at most this share: its clocks are good to some hundred parts per million."""
 GAP_PERIODS = 3.0
 """A longer pause between samples splits a recording; it is not interpolated."""
 
@@ -80,7 +82,7 @@ def period_of(table: Table) -> float:
 
 
 def common_period(tables: Sequence[Table]) -> float:
-    """Return one period for several recordings of a robot [s], so that they share one description.
+    """Return one period for several recordings of a robot [s], for software that knows one rate.
 
     Raises:
         DatasetError: They were recorded at rates that differ by more than 2 %.
@@ -90,10 +92,47 @@ def common_period(tables: Sequence[Table]) -> float:
     if np.any(np.abs(periods / middle - 1) > EVEN):
         rates = ", ".join(f"{table.name}: {1 / p:.4g} Hz" for table, p in zip(tables, periods, strict=True))
         raise DatasetError(
-            f"recordings of different rates do not fit into one dataset ({rates}); import them into "
-            "several datasets"
+            f"these recordings have different rates ({rates}), and one is needed here; use recordings of one "
+            "rate at a time"
         )
     return middle
+
+
+def grid_periods(tables: Sequence[Table]) -> list[float]:
+    """Return the period of each recording's grid [s]; recordings of one rate share the median of theirs.
+
+    They have one rate if their clocks agree, or if no stamp moves by more than half a period.
+    """
+    periods = np.array([period_of(table) for table in tables])
+    lasts_s = np.array([np.ptp(_clock(table)[0]) for table in tables])
+    found = periods.copy()
+    groups = [np.argsort(periods, kind="stable")]
+    while groups:
+        rows = groups.pop()
+        shared = float(np.median(periods[rows]))
+        off = np.abs(periods[rows] / shared - 1)
+        one = (off <= CLOCKS) | ((off <= EVEN) & (off * lasts_s[rows] <= shared / 2))
+        if one.all():
+            found[rows] = shared
+        else:
+            apart = int(np.argmax(np.diff(np.log(periods[rows])))) + 1
+            groups += [rows[:apart], rows[apart:]]
+    return [float(period) for period in found]
+
+
+def unevenness_s(table: Table) -> float:
+    """Return how far the stamps of a recording lie beside those of an even clock at most [s].
+
+    Each part between pauses has a clock of its own: its rate and its zero are fitted.
+    """
+    clock, period = _clock(table)[0], period_of(table)
+    worst = 0.0
+    for part in np.split(clock, np.flatnonzero(np.diff(clock) > GAP_PERIODS * period) + 1):
+        if part.size > 2:
+            index = np.concatenate(([0.0], np.round(np.diff(part) / period).clip(1).cumsum()))
+            even = np.polynomial.Polynomial.fit(index, part, 1)(index)
+            worst = max(worst, float(np.max(np.abs(part - even))))
+    return worst
 
 
 def to_trajectories(
@@ -148,7 +187,7 @@ def to_trajectories(
             "period_s": period,
         }
         recordings.append(_recording(table, rows[part], clock[part], period, gains, facts))
-    return recordings
+    return [recording for recording in recordings if recording is not None]
 
 
 def with_earlier_commands(trajectory: Trajectory, by_s: float) -> Trajectory:
@@ -207,7 +246,8 @@ def _recording(
     period: float,
     gains: Gains | None,
     facts: dict[str, Any],
-) -> Recording:
+) -> Recording | None:
+    """Return a part on the grid; None where fewer than two points of the grid lie in it."""
     values = {"position": table.position[rows], "velocity": _velocity(table, rows, clock)}
     values["effort"] = (
         np.full(values["position"].shape, np.nan) if table.effort is None else table.effort[rows]
@@ -226,6 +266,8 @@ def _recording(
     even = not uneven.any()
     put = _keep if even else _interpolate
     placed = put(clock, index, period, values, table.command_s)
+    if placed is None:
+        return None
     metadata = {
         "purpose": "import",
         "import": {**facts, "method": placed.method, "largest_shift_s": placed.shift_s},
@@ -251,7 +293,7 @@ def _keep(
 
 def _interpolate(
     clock: FloatArray, index: IntArray, period: float, values: dict[str, FloatArray], command_s: FloatArray
-) -> _Placed:
+) -> _Placed | None:
     """Interpolate the measurements linearly at the grid's times; commands keep their own times."""
     origin = clock[0] + float(np.median(clock - clock[0] - index * period))
     first = np.ceil((clock[0] - origin) / period - EVEN)
@@ -259,6 +301,8 @@ def _interpolate(
     times = origin + number * period
     after = np.clip(np.searchsorted(clock, times), 1, clock.size - 1)
     known = clock[after] - clock[after - 1] <= GAP_PERIODS * period
+    if np.count_nonzero(known) < 2:
+        return None
     number, times, after = number[known], times[known], after[known]
     nearest = np.minimum(np.abs(clock[after] - times), np.abs(clock[after - 1] - times))
     read = {

@@ -11,8 +11,6 @@ from deal_hw.data.checks.following import followed_part
 from deal_hw.schema import plain
 from deal_hw.types import Trajectory
 
-SHORTEST_S = 1.0
-"""Least time of usable samples, over all recordings, that can be calibrated [s]."""
 LEAST_MOTION = 20.0
 """Least motion of a joint [multiples of its sensor's noise]."""
 FEWEST_CHANGES = 5

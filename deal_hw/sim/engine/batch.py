@@ -22,7 +22,7 @@ from deal_hw.parameters import ParameterSpace
 from deal_hw.sim.engine.effort import TORQUE, EffortSensors, effort_joints
 from deal_hw.sim.engine.engines import Engine, MujocoEngine, State
 from deal_hw.sim.engine.gpu import EngineName
-from deal_hw.sim.engine.model import RobotModel, drop_command_laws
+from deal_hw.sim.engine.model import RobotModel, at_step, drop_command_laws
 from deal_hw.sim.engine.step_laws import StepLaws
 from deal_hw.sim.engine.tangent_coordinates import IDENTITY, to_quaternion, to_vector
 from deal_hw.sim.engine.transmission import check_engine, take_constant_torques
@@ -505,7 +505,7 @@ class ServoBatch:
 
 
 class BatchPool:
-    """The last used simulators of one robot and space, by number of members.
+    """The last used simulators of one robot and space, by number of members and physics step.
 
     A simulator holds one MjData per thread: tens of megabytes of address space, up to some megabytes in use.
     Without a limit, searches with stages of different sizes would keep one for every size.
@@ -528,7 +528,7 @@ class BatchPool:
     ) -> None:
         self._robot, self._space, self._most = robot, space, most
         self.threads = threads or default_threads()
-        self._kept: dict[tuple[int, int, str, EngineName], list[ServoBatch]] = {}
+        self._kept: dict[tuple[int, int, str, EngineName, float], list[ServoBatch]] = {}
         self._most *= 1 + len(robot.setups)
         self.counted = counted or StepCount()
 
@@ -544,27 +544,35 @@ class BatchPool:
         """Physics steps of all simulators so far, including dropped ones and those with the same count."""
         return self.counted.steps
 
-    def get(self, count: int, setup: str = "", engine: EngineName = "mujoco") -> ServoBatch:
+    def get(
+        self, count: int, setup: str = "", engine: EngineName = "mujoco", step_s: float | None = None
+    ) -> ServoBatch:
         """Return the simulator of ``count`` members in a set-up, with parameters and state of its last user.
 
         Args:
             count: Members.
             setup: Name of the set-up; "" for the model itself.
             engine: What simulates.
+            step_s: Physics step; None for the model's [s].
         """
-        return self._take(count, 1, setup, engine)[0]
+        return self._take(count, 1, setup, engine, step_s)[0]
 
-    def parts(self, count: int, setup: str = "") -> list[ServoBatch]:
+    def parts(self, count: int, setup: str = "", step_s: float | None = None) -> list[ServoBatch]:
         """Return simulators with ``count`` members in all: one of one thread for each thread.
 
         Arguments are those of :meth:`get`.
         So the work between two steps of a closed loop is divided among the threads, too. The result does not
         depend on their number.
         """
-        return self._take(count, min(self.threads, count), setup, "mujoco")
+        return self._take(count, min(self.threads, count), setup, "mujoco", step_s)
 
-    def _take(self, count: int, parts: int, setup: str, engine: EngineName) -> list[ServoBatch]:
-        key, robot = (count, parts, setup, engine), self._robot.in_setup(setup)
+    def _take(
+        self, count: int, parts: int, setup: str, engine: EngineName, step_s: float | None
+    ) -> list[ServoBatch]:
+        robot = self._robot.in_setup(setup)
+        if step_s is not None and step_s != robot.step_s:
+            robot = at_step(robot, step_s)
+        key = count, parts, setup, engine, robot.step_s
         sizes = [count // parts + (i < count % parts) for i in range(parts)]
         threads = max(self.threads // parts, 1)
         kept = self._kept.pop(key, None) or [
@@ -572,6 +580,6 @@ class BatchPool:
         ]
         # Last in order is last used.
         self._kept[key] = kept
-        if len(self._kept) > self._most:
+        if len(self._kept) > self._most * len({step_s for *_, step_s in self._kept}):
             self._kept.pop(next(iter(self._kept)))
         return kept

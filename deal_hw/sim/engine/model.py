@@ -268,6 +268,17 @@ def at_step(robot: RobotModel, step_s: float) -> RobotModel:
     return dataclasses.replace(robot, model=model, setups=setups)
 
 
+def fitted_step(period_s: float, step_s: float) -> float:
+    """Return the physics step near a wanted one of which a device period has a whole number [s].
+
+    Args:
+        period_s: The device period [s].
+        step_s: The wanted step [s].
+    """
+    steps = max(round(period_s / step_s), 1)
+    return step_s if abs(period_s / step_s - steps) < 1e-6 else period_s / steps
+
+
 def model_with(robot: RobotModel, space: ParameterSpace, theta: FloatArray) -> mujoco.MjModel:
     """Return a copy of the model with the parameters set, (K,)."""
     model = copy.copy(robot.model)

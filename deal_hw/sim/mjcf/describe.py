@@ -139,6 +139,21 @@ def describe(
     )
 
 
+def at_rates(description: RobotDescription, rates: Sampling) -> RobotDescription:
+    """Return the description with the rates of recordings."""
+    return dataclasses.replace(
+        description,
+        control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
+        device_rate_hz=1.0 / rates.step_s,
+        state_rate_hz=1.0 / rates.period_s,
+    )
+
+
+def slowest(rates: Sequence[Sampling]) -> Sampling:
+    """Return the sampling that describes a robot with recordings of several rates: the slowest."""
+    return max(rates, key=lambda each: each.period_s)
+
+
 def with_speed_limits(description: RobotDescription, model: Any, space: ParameterSpace) -> RobotDescription:
     """Return the description with set-point speed limits from the parameters' nominal values.
 

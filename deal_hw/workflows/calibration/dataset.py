@@ -13,12 +13,13 @@ from deal_hw.description import RobotDescription
 from deal_hw.errors import InsufficientDataError
 from deal_hw.types import Trajectory
 from deal_hw.workflows.calibration.episodes import choose_episodes, remaining
+from deal_hw.workflows.calibration.recordings import one_rate, say_rates
 from deal_hw.workflows.calibration.settings import (
     DatasetSettings,
     DriverDatasetSettings,
     OwnDatasetSettings,
 )
-from deal_hw.workflows.calibration.source import Source
+from deal_hw.workflows.calibration.source import Named, Source
 from deal_hw.workflows.calibration.space import (
     extended,
     named_space,
@@ -77,8 +78,8 @@ def read_driver_dataset(settings: DriverDatasetSettings, say: Say) -> Source:
     return Source(
         robot=robot,
         space=without_speed_limits(space, description, trajectories.values(), say),
-        fitted=[(dataset.path(i).name, trajectories[i]) for i in fit],
-        held=[(dataset.path(i).name, trajectories[i]) for i in held],
+        fitted=[Named(dataset.path(i).name, trajectories[i]) for i in fit],
+        held=[Named(dataset.path(i).name, trajectories[i]) for i in held],
         division=None,
         sample_hz=settings.sample_hz or SAMPLES_A_PERIOD * description.control_rate_hz,
         feet=description.feet,
@@ -96,9 +97,10 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
 
     Arguments and errors are those of :func:`read_driver_dataset`.
     """
+    from deal_hw.data.checks.suite import nominal_period_s
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.engine.model import load_model
-    from deal_hw.sim.mjcf.describe import sampling, with_speed_limits
+    from deal_hw.sim.mjcf.describe import at_rates, sampling, slowest, with_speed_limits
 
     division = settings.division(judged=bool(settings.holdout))
     dataset, description = _opened(settings)
@@ -125,24 +127,27 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
     fit, held = remaining(dataset, fit, held, trajectories)
     space = searched_space(settings, model, say)
     timestep = float(model.opt.timestep) if settings.physics_step is None else settings.physics_step
-    rates = sampling(1.0 / description.state_rate_hz, timestep, settings.window)
+    usual_s = 1.0 / description.state_rate_hz
+    every = {
+        i: sampling(nominal_period_s(trajectory) or usual_s, timestep, settings.window)
+        for i, trajectory in trajectories.items()
+    }
+    say_rates([dataset.path(i).name for i in every], [*every.values()], say)
+    rates = slowest([*every.values()])
     in_loop = None
     if policy is not None and settings.in_closed_loop:
         from deal_hw.workflows.calibration.policy import policy_of_files
         from deal_hw.workflows.calibration.policy_commands import at_policy_rate
 
-        rates = at_policy_rate(rates, policy)
+        rates = at_policy_rate(one_rate([*every.values()]), policy)
+        every = dict.fromkeys(every, rates)
         in_loop = functools.partial(policy_of_files, policy)
-    description = dataclasses.replace(
-        description,
-        device_rate_hz=1.0 / rates.step_s,
-        control_rate_hz=1.0 / (rates.period_s * rates.samples_per_tick),
-    )
+    description = at_rates(description, rates)
     return Source(
         robot=load_model(with_speed_limits(description, model, space), rates.step_s),
         space=space,
-        fitted=[(dataset.path(i).name, trajectories[i]) for i in fit],
-        held=[(dataset.path(i).name, trajectories[i]) for i in held],
+        fitted=[Named(dataset.path(i).name, trajectories[i], every[i]) for i in fit],
+        held=[Named(dataset.path(i).name, trajectories[i], every[i]) for i in held],
         division=division,
         sample_hz=settings.sample_hz,
         feet=description.feet,
@@ -151,9 +156,11 @@ def read_own_dataset(settings: OwnDatasetSettings, say: Say) -> Source:
             **_provenance(dataset, fit),
             "holdout": list(held) or f"last {division.share:.0%} of each recording",
             "sampling": dataclasses.asdict(rates),
+            "rates_hz": sorted({1.0 / each.period_s for each in every.values()}),
         },
         advice="import recordings of other motion, and name their episodes with --holdout",
         policy=None if in_loop is None else in_loop(description, space, settings.latency_range, say),
+        rates=rates,
     )
 
 

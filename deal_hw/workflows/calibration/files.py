@@ -14,10 +14,13 @@ from deal_hw.workflows.calibration.checks import examine_recording
 from deal_hw.workflows.calibration.recordings import (
     Recorded,
     at_rest_without_commands,
-    common_rates,
     named_on_grid,
+    one_rate,
     read_tables,
+    recorded_rates,
     refuse_copies,
+    say_rates,
+    say_uneven,
     without,
 )
 from deal_hw.workflows.calibration.settings import FilesSettings
@@ -46,7 +49,7 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
     from deal_hw.data.checks.suite import despiked
     from deal_hw.sim.engine.compiling import compile_mjcf
     from deal_hw.sim.engine.model import load_model
-    from deal_hw.sim.mjcf.describe import describe, with_speed_limits
+    from deal_hw.sim.mjcf.describe import describe, slowest, with_speed_limits
     from deal_hw.sim.mjcf.joint_facts import joint_facts
 
     data: Sequence[Recorded] = settings.data
@@ -67,13 +70,17 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
 
         policy = OnnxPolicy(settings.policy)
     fitted, held = _tables(settings, (("data", data), ("holdout", holdout)), policy, facts, say)
-    rates = common_rates([*fitted, *held], model, settings.physics_step, settings.window)
+    every = recorded_rates([*fitted, *held], model, settings.physics_step, settings.window)
+    say_rates([table.name for table in (*fitted, *held)], every, say)
+    say_uneven([*fitted, *held], every, say)
+    rates = slowest(every)
     in_loop = None
     if policy is not None and settings.in_closed_loop:
         from deal_hw.workflows.calibration.policy import policy_of_files
         from deal_hw.workflows.calibration.policy_commands import at_policy_rate
 
-        rates = at_policy_rate(rates, policy)
+        rates = at_policy_rate(one_rate(every), policy)
+        every = [rates] * len(every)
         in_loop = functools.partial(policy_of_files, policy)
     description = describe(path, model, fitted[0].joint_names, fitted[0].actuated, rates)
     description = with_speed_limits(description, model, space)
@@ -93,8 +100,8 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
     return Source(
         robot=robot,
         space=space,
-        fitted=named_on_grid(fitted, robot, rates),
-        held=named_on_grid(held, robot, rates),
+        fitted=named_on_grid(fitted, robot, every[: len(fitted)]),
+        held=named_on_grid(held, robot, every[len(fitted) :]),
         division=division,
         sample_hz=None,
         feet=tuple(settings.feet),
@@ -111,9 +118,11 @@ def read_files(settings: FilesSettings, say: Say) -> Source:
             or f"last {division.share:.0%} of each recording",
             "left_out": [list(entry) for entry in settings.leave_out],
             "sampling": dataclasses.asdict(rates),
+            "rates_hz": sorted({1.0 / each.period_s for each in every}),
         },
         advice="name recordings of other motion with --holdout",
         policy=None if in_loop is None else in_loop(description, space, settings.latency_range, say),
+        rates=rates,
     )
 
 

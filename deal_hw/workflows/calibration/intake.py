@@ -26,6 +26,7 @@ from deal_hw.ranges import Range
 from deal_hw.types import BaseTrajectory, FloatArray, Trajectory
 from deal_hw.workflows.calibration.checks import require_base, sensitive_parameters, warn_of_gravity
 from deal_hw.workflows.calibration.settings import (
+    HELDOUT_WINDOW_S,
     CalibrateSettings,
     DriverDatasetSettings,
     FilesSettings,
@@ -33,7 +34,7 @@ from deal_hw.workflows.calibration.settings import (
     UserRobotSettings,
 )
 from deal_hw.workflows.calibration.setups import given_setups, in_setups
-from deal_hw.workflows.calibration.source import Division, Source
+from deal_hw.workflows.calibration.source import Division, Named, Source
 from deal_hw.workflows.calibration.space import without_idle_limits
 from deal_hw.workflows.say import Say, silent
 
@@ -46,6 +47,11 @@ if TYPE_CHECKING:
 STRETCH_S = 2.5
 """Fitted recordings are cut into parts of about this length, so that some lie in every motion [s]."""
 HELDOUT_STRETCH_S = 20.0
+SHORT_S = 1.6
+"""Of shorter recordings, many at a time, some are held out as a whole [s]: a quarter of one would hold a
+prediction or two, both in the smoother's reach of its ends."""
+HELDOUT_LEAST_S = 1.25 * HELDOUT_WINDOW_S
+"""Least length of a part that is held out [s]: a prediction fits in with a sample or two to spare."""
 GAIT_SMOOTHING_S = 0.04
 """Landing feet change joint velocities within about 10 ms; longer smoothing biases the states there [s]."""
 WALK_TELLS = (
@@ -148,14 +154,14 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
     if setups is not None:
         source = in_setups(source, setups, settings.named(), say)
     robot, space, division = source.robot, source.space, source.division
-    trajectories = [trajectory for _, trajectory in (*source.fitted, *source.held)]
+    trajectories = [one.trajectory for one in (*source.fitted, *source.held)]
     if division is not None:
         require_base(robot, source.feet, trajectories)
     known_std = expected_std(settings.residual_std, robot, trajectories[0].base)
     provenance = dict(source.provenance)
     if robot.latency_s:
         provenance["model_latency_s"] = robot.latency_s
-    fit, judge = ([aligned(source, *one) for one in some] for some in (source.fitted, source.held))
+    fit, judge = ([aligned(source, one) for one in some] for some in (source.fitted, source.held))
     if settings.named() in UNALIGNED_METHODS:
         say(
             f"{settings.named()} compares distributions of motion. In these recordings commands and states "
@@ -165,7 +171,9 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
         )
     if isinstance(settings, UserRobotSettings):
         space = without_idle_limits(space, settings, robot, fit)
-    shown = trajectories[0]
+    # `--watch` has one rate, that of the robot's description.
+    of_robot = [one.trajectory for one in source.fitted if one.rates in (None, source.rates)]
+    shown = (of_robot or trajectories)[0]
     walks = division is None and all_walk(robot, trajectories)
     if walks:
         space = weighed(space, robot, shown, say)
@@ -200,12 +208,15 @@ def _input_of(source: Source, settings: CalibrateSettings, say: Say) -> Calibrat
     )
 
 
-def aligned(source: Source, name: str, trajectory: Trajectory) -> SampledEpisode:
-    """Return a recording on the physics grid; a floating robot's one includes the base."""
+def aligned(source: Source, one: Named) -> SampledEpisode:
+    """Return a recording on its physics grid; a floating robot's one includes the base."""
+    from deal_hw.sim.mjcf.describe import at_rates
     from deal_hw.sim.recordings.episode import align, fill_gaps, thin
 
-    robot = source.robot
-    episode = align(trajectory, robot.description, name)
+    robot, trajectory, description = source.robot, one.trajectory, source.robot.description
+    if one.rates is not None:
+        description = at_rates(description, one.rates)
+    episode = align(trajectory, description, one.name)
     if robot.base is not None and trajectory.base is not None:
         from deal_hw.sim.recordings.measured_base import with_measured_base
 
@@ -282,12 +293,11 @@ def divided(
         division: How parts are chosen.
         say: Called with a sentence if not all is fitted.
     """
-    from deal_hw.sim.recordings.parts import split_last, spread, stretches
+    from deal_hw.sim.recordings.parts import spread, stretches
 
     fit, held = list(episodes), list(judge)
     if division.share > 0:
-        pairs = [split_last(e, division.share) for e in episodes]
-        fit, held = [first for first, _ in pairs], [last for _, last in pairs]
+        fit, held = held_out(episodes, division.share, say)
     parts = [p for e in fit for p in stretches(e, max(STRETCH_S, 3 * division.window_s))]
     chosen = spread(parts, division.fit_seconds)
     if len(chosen) < len(parts):
@@ -297,6 +307,48 @@ def divided(
         )
     held = [p for e in held for p in stretches(e, HELDOUT_STRETCH_S)]
     return _without_scraps(chosen, say), _without_scraps(held, say)
+
+
+def held_out(
+    episodes: Sequence[SampledEpisode], share: float, say: Say
+) -> tuple[list[SampledEpisode], list[SampledEpisode]]:
+    """Return what is fitted of recordings, and the share of them that is held out.
+
+    It is the last part of each recording. The last part of a short one would hold hardly a prediction, so of
+    many short ones every few are held out as a whole.
+
+    Args:
+        episodes: The recordings, or the parts between their pauses.
+        share: The share that is held out.
+        say: Called with a sentence on short ones.
+    """
+    from deal_hw.sim.recordings.parts import split_last
+
+    every = max(round(1 / share), 2)
+    fit: list[SampledEpisode] = []
+    held: list[SampledEpisode] = []
+    short = [e for e in episodes if seconds_of(e) < SHORT_S]
+    whole = short[every - 1 :: every]
+    for episode in episodes:
+        if any(episode is one for one in whole):
+            held.append(episode)
+        elif seconds_of(episode) * share < HELDOUT_LEAST_S or (whole and seconds_of(episode) < SHORT_S):
+            fit.append(episode)
+        else:
+            first, last = split_last(episode, share)
+            fit.append(first)
+            held.append(last)
+    if whole:
+        say(
+            f"{len(short)} recordings or parts are shorter than {SHORT_S:g} s: {len(whole)} of them are held "
+            "out as a whole, the others are fitted"
+        )
+    if not held:
+        say(
+            f"no recording is long enough to hold a part out ({share:.0%} of it must last "
+            f"{HELDOUT_LEAST_S:g} s), so all is fitted, and no held-out error is known"
+        )
+    return fit, held
 
 
 def _without_scraps(episodes: Sequence[SampledEpisode], say: Say) -> list[SampledEpisode]:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from deal_hw.sim.mjcf.describe import Sampling
     from deal_hw.sim.mjcf.joint_facts import JointFacts
 
+UNEVEN = 0.01
+"""A stamp that lies further beside an even clock is said [sampling periods]."""
+
 Recorded = Path | str | Mapping[str, Any] | Any
 """A recording: a file's path, or data in memory (:mod:`deal_hw.data.importing.memory_source`)."""
 
@@ -83,10 +86,10 @@ def refuse_copies(tables: Sequence[Table]) -> None:
             )
 
 
-def common_rates(
+def recorded_rates(
     tables: Sequence[Table], model: Any, physics_step_s: float | None, window_s: float
-) -> Sampling:
-    """Check that recordings have the same joints and rate; return their place on the physics grid.
+) -> list[Sampling]:
+    """Check that recordings have the same joints; return the place of each on its physics grid.
 
     Args:
         tables: All recordings.
@@ -96,10 +99,10 @@ def common_rates(
 
     Raises:
         ConfigurationError: They have different joints, or a setting cannot be used.
-        DatasetError: A clock is invalid, or rates differ.
+        DatasetError: A clock is invalid.
     """
     from deal_hw.data.checks.suite import examine, require
-    from deal_hw.data.importing.grid import common_period
+    from deal_hw.data.importing.grid import grid_periods
     from deal_hw.sim.mjcf.describe import sampling
 
     first = tables[0]
@@ -115,7 +118,46 @@ def common_rates(
         found = examine(table, efforts=not model_has_servos(model))
         require([v for v in found if v.code in REQUIRED_CHECKS], table.name)
     timestep = float(model.opt.timestep) if physics_step_s is None else physics_step_s
-    return sampling(common_period(tables), timestep, window_s)
+    return [sampling(period_s, timestep, window_s) for period_s in grid_periods(tables)]
+
+
+def say_rates(names: Sequence[str], rates: Sequence[Sampling], say: Callable[[str], None]) -> None:
+    """Say which rates recordings have, if there are several."""
+    alike: dict[float, list[str]] = {}
+    for name, each in zip(names, rates, strict=True):
+        alike.setdefault(each.period_s, []).append(name)
+    if len(alike) > 1:
+        groups = (f"{1 / period_s:.4g} Hz ({', '.join(of)})" for period_s, of in alike.items())
+        say(f"{len(alike)} rates: {'; '.join(groups)}. Each recording is fitted on its own grid")
+
+
+def say_uneven(tables: Sequence[Table], rates: Sequence[Sampling], say: Callable[[str], None]) -> None:
+    """Say which recordings have an uneven clock."""
+    from deal_hw.data.importing.grid import unevenness_s
+
+    off_s = [unevenness_s(table) for table in tables]
+    uneven = [
+        f"{table.name} by up to {1e3 * off:.2g} ms"
+        for table, off, each in zip(tables, off_s, rates, strict=True)
+        if off > UNEVEN * each.period_s
+    ]
+    if uneven:
+        say(f"uneven clock: {', '.join(uneven)}. The samples are put on an even grid")
+
+
+def one_rate(rates: Sequence[Sampling]) -> Sampling:
+    """Return the rates of recordings whose policy is simulated, too: they must be the same.
+
+    Raises:
+        ConfigurationError: They differ.
+    """
+    if len(set(rates)) > 1:
+        found = ", ".join(f"{hz:.4g}" for hz in sorted({1 / r.period_s for r in rates}))
+        raise ConfigurationError(
+            f"the recordings have several rates ({found} Hz), and this method simulates the policy at one; "
+            "leave out --method, or calibrate the recordings of one rate"
+        )
+    return rates[0]
 
 
 def model_has_servos(model: Any) -> bool:
@@ -186,14 +228,14 @@ def _rows(table: Table, keep: Any) -> Table:
     return table.rows(keep)
 
 
-def named_on_grid(tables: Sequence[Table], robot: RobotModel, rates: Sampling) -> list[Named]:
-    """Return recordings on the grid with their names; a table with pauses gives several."""
+def named_on_grid(tables: Sequence[Table], robot: RobotModel, rates: Sequence[Sampling]) -> list[Named]:
+    """Return recordings on their grids with their names; a table with pauses gives several."""
     found = []
-    for table in tables:
-        recordings = on_grid(table, robot, rates)
+    for table, own in zip(tables, rates, strict=True):
+        recordings = on_grid(table, robot, own)
         for number, recording in enumerate(recordings, 1):
             part = f", part {number} of {len(recordings)}" if len(recordings) > 1 else ""
-            found.append((table.name + part, recording.trajectory))
+            found.append(Named(table.name + part, recording.trajectory, own))
     return found
 
 

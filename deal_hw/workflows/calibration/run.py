@@ -18,7 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deal_hw import findings
-from deal_hw.calib.pipeline.methods import CLOSED_LOOP_METHODS, make_method, search_of, takes_engine
+from deal_hw.calib.pipeline.methods import (
+    CLOSED_LOOP_METHODS,
+    make_method,
+    search_of,
+    takes_engine,
+    with_rates,
+)
 from deal_hw.calibration import (
     EXPLAINED_CHI2,
     LATENCY,
@@ -126,6 +132,8 @@ def calibrate_or_raise(
 
     _require_windows(work.holdout, settings.heldout_window)
     problem = _problem(settings, work, method, say)
+    if problem.rates > 1:
+        method = with_rates(method)
     window_s, threads = settings.heldout_window, settings.threads
     held_out = HeldOut(work.robot, work.space, work.holdout, window_s, threads) if work.holdout else None
 

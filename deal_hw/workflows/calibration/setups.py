@@ -49,7 +49,7 @@ def in_setups(source: Source, setups: Setups, method: str, say: Say) -> Source:
             f"{method} simulates all recordings with one model, so it cannot fit several set-ups; leave out "
             "--method, or the set-ups"
         )
-    names = [name for name, _ in (*source.fitted, *source.held)]
+    names = [one.name for one in (*source.fitted, *source.held)]
     setups.check_used(names, source.robot.description)
     robot = setups.robot(source.robot, source.space)
     space = with_setups(source.space, robot, setups)

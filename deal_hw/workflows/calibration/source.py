@@ -13,10 +13,23 @@ if TYPE_CHECKING:
     from deal_hw.calib.data.population_policy import PopulationPolicy
     from deal_hw.motions.behaviours import Behaviour
     from deal_hw.sim.engine.model import RobotModel
+    from deal_hw.sim.mjcf.describe import Sampling
     from deal_hw.sim.recordings.setups import Setups
 
-Named = tuple[str, Trajectory]
-"""A recording with the name that messages give it."""
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A recording.
+
+    Attributes:
+        name: Its name in messages.
+        trajectory: Its data.
+        rates: Its own grid; None: that of the robot's description.
+    """
+
+    name: str
+    trajectory: Trajectory
+    rates: Sampling | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +66,7 @@ class Source:
         name: Name under which `deal-hw collect` records this robot; "" if it cannot.
         policy: The policy that moved the robot all the time, if the method needs it.
         setups: Which recordings were made with a change of the robot; None: all with the model itself.
+        rates: The grid that the robot's description has; None: that of a robot with a driver.
     """
 
     robot: RobotModel
@@ -69,3 +83,4 @@ class Source:
     name: str = ""
     policy: PopulationPolicy | None = None
     setups: Setups | None = None
+    rates: Sampling | None = None
