@@ -538,7 +538,7 @@ def test_columns_that_do_not_exist_are_never_replaced_by_their_place(tmp_path: P
 def test_unknown_files(tmp_path: Path) -> None:
     """A file of no known kind, a missing one, and a folder without a dataset are refused."""
     for path, words in (
-        (write(tmp_path / "a.bag", "x"), "'.bag' are not known"),
+        (write(tmp_path / "a.ulg", "x"), "'.ulg' are not known"),
         (tmp_path / "none.csv", "does not exist"),
         (tmp_path, "a LeRobot dataset"),
     ):
