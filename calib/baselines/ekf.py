@@ -175,7 +175,7 @@ class _Passes(Stepper):
                 np.append(np.full(len(problem.space), PARAMETER_STEP), LATENCY_STEP_S)[:P],
             ]
         )
-        drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.episodes[0].period_s)
+        drift = settings.parameter_drift * self._drift[:P] * math.sqrt(problem.period_s)
         # Q: the simulation of one sample counts as exact, so only the parameters drift.
         noise = np.append(np.zeros(n), drift) ** 2
         return ExtendedKalman(np.append(np.zeros(n), self._value[:P]), covariance, n, steps, noise)

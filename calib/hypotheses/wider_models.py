@@ -14,7 +14,7 @@ import numpy as np
 from deal_hw.calib.data.parts import BEGIN_S, part_of, samples_in
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.refinement import Refined, at_parameters, refine
-from deal_hw.calib.fit.solver import correlated_samples
+from deal_hw.calib.fit.solver import independent_samples
 from deal_hw.calib.hypotheses.judge import UnseenGain
 from deal_hw.calib.hypotheses.thresholds import WINDOW_S
 from deal_hw.errors import CalibrationError, InsufficientDataError
@@ -128,7 +128,8 @@ def held_out(wide: WiderFit, refined: Refined, asked: int = 1) -> UnseenGain | N
     )
     length, left = prediction.shooting.length, prediction.normal
     # What it leaves counts once for each correlation time. What it explains is alike over many samples, too.
-    count = left.count / correlated_samples(left.residual, length)
+    sizes = [r.size for r in left.residual]
+    count = left.count * independent_samples(left.residual, sizes, left.periods_s) / sum(sizes)
 
     def gained(theta: FloatArray, latency_s: float) -> UnseenGain:
         return UnseenGain(at_parameters(unseen, theta, latency_s, length).chi2, prediction.chi2, count)

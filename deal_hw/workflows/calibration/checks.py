@@ -229,9 +229,7 @@ def sensitive_parameters(
 
     problem = Problem(robot, space, episodes, threads=threads, known_std=known_std)
     # Raises if not even one window of that length fits.
-    problem.windows(
-        samples_in(problem, window_s), offset=round(problem.smoothing_s / 2 / episodes[0].period_s)
-    )
+    problem.windows(samples_in(problem, window_s), offset=round(problem.smoothing_s / 2 / problem.period_s))
     try:
         check_excitation(problem)
     except InsufficientDataError as err:
