@@ -175,7 +175,7 @@ def test_plausible_latencies_that_disagree_cost_a_verdict() -> None:
         SimpleNamespace(theta=np.array([a, 1.0]), latency_s=0.003, chi2=1.0, normal=SimpleNamespace(cost=9.0))
         for a in (1.0, 1.65)
     ]
-    problem = SimpleNamespace(episodes=[SimpleNamespace(step_s=1e-3)], latency_range_s=(0.0, 0.04))
+    problem = SimpleNamespace(step_s=1e-3, latency_range_s=(0.0, 0.04))
     scan = LatencyScan((3, 4), cast("tuple[Refined, ...]", tuple(fits)))
     found = averaged(cast("Problem", problem), scan, reported)
     assert found.verdicts == ("weak", "identifiable")

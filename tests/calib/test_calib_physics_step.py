@@ -132,7 +132,8 @@ def test_the_halved_problem_shares_all_but_the_step(tmp_path: Path) -> None:
     """The model itself is not touched; steps count together, so a check is charged for them."""
     problem, *_ = checked(tmp_path, STEP_S)
     finer = halved(problem)
-    assert finer.robot.step_s == pytest.approx(STEP_S / 2) and problem.robot.step_s == STEP_S
+    assert finer.robot.step_s == pytest.approx(STEP_S / 2)
+    assert problem.robot.step_s == pytest.approx(STEP_S)
     assert finer.starts is problem.starts and finer.steps == problem.steps > 0
 
 

@@ -432,8 +432,8 @@ def test_recording_without_excitation_is_refused_before_any_search(ideal: Case) 
     with pytest.raises(InsufficientDataError, match=r"hardly moves.*--motion rich"):
         CalibrationPipeline(search).run(problem, Budget(), np.random.default_rng(0))
     assert search.budgets == []
-    short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 60)
-    with pytest.raises(InsufficientDataError, match=r"0\.30 s of usable samples"):
+    short = dataclasses.replace(ideal.fit, usable=np.arange(len(ideal.fit.sample)) < 30)
+    with pytest.raises(InsufficientDataError, match=r"0\.15 s of usable samples"):
         check_excitation(Problem(ideal.robot, ideal.space, [short], threads=1))
 
 

@@ -259,8 +259,8 @@ def frozen(rows: Rows) -> Rows:
 
 
 def short(rows: Rows) -> Rows:
-    """Half a second."""
-    return {k: v[:26] for k, v in rows.items()}
+    """A tenth of a second, at 50 Hz."""
+    return {k: v[:6] for k, v in rows.items()}
 
 
 def no_commands(rows: Rows) -> Rows:
@@ -282,7 +282,7 @@ def one_joint(rows: Rows) -> Rows:
         (backwards, "backwards"),
         (broken, "not finite"),
         (frozen, "without any change"),
-        (short, "at least 2 s"),
+        (short, "record at least 0.2 s"),
         (no_commands, "target"),
         (one_joint, "joints of the model without a recorded position: elbow"),
     ],
@@ -307,7 +307,7 @@ def test_bad_recordings_are_refused(
         (["--residual-std", "shoulder", "0.001"], "each of shoulder, elbow"),
         (["--holdout-part", "1.5"], "allowed are 0 to 0.95"),
         (["--physics-step", "0"], "allowed are 0.001 to 100 ms"),
-        (["--window", "9"], "no window"),
+        (["--window", "9"], "no recording holds a window of 9.00 s"),
         (["--heldout-window", "4"], "held-out recordings are too short"),
         (["--leave-out", "nothing.csv", "0", "1"], "no such recording; known are rec.csv"),
         (["--leave-out", "rec.csv", "0", "99"], "--leave-out removes all of rec.csv"),

@@ -157,12 +157,12 @@ def test_import_refuses_what_is_not_plausible(
 
 
 def test_force_is_not_advised_where_it_would_not_help(recording: Path, tmp_path: Path) -> None:
-    """A recording of a second has no rate to trust: no option overrules that, and none is named."""
+    """A recording of a tenth of a second holds no window: no option overrules that, and none is named."""
     lines = recording.read_text(encoding="utf-8").splitlines()
-    recording.write_text("\n".join(lines[:100]) + "\n", encoding="utf-8")
+    recording.write_text("\n".join(lines[:11]) + "\n", encoding="utf-8")
     (tmp_path / "robot.xml").write_text(MODEL)
     for force in (False, True):
-        with pytest.raises(DatasetError, match="record at least 2 s") as refused:
+        with pytest.raises(DatasetError, match=r"record at least 0\.2 s") as refused:
             data(Import(paths=(recording,), out=tmp_path / "out", model=tmp_path / "robot.xml", force=force))
         assert "--force" not in str(refused.value)
 

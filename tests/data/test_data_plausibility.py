@@ -83,12 +83,15 @@ def test_equal_stamps(make_table: MakeTable, step: int, severity: Severity) -> N
 
 
 def test_gaps_are_counted(make_table: MakeTable) -> None:
-    """A pause of 1 s in 13 s is a warning, one of 5 s in 17 s a refusal."""
-    for pause_s, severity in ((1.0, Severity.WARN), (5.0, Severity.FAIL)):
-        time_s = make_table().time_s.copy()
-        time_s[700:] += pause_s
-        found = verdict(make_table(time_s=time_s, command_s=time_s), "gaps")
-        assert found.severity is severity and "1 gaps" in found.message
+    """A pause, however long, is between two parts; where each third sample is alone, nothing can be fitted."""
+    time_s = make_table().time_s
+    for pause_s in (1.0, 5.0):
+        paused = np.where(np.arange(time_s.size) < 700, time_s, time_s + pause_s)
+        found = verdict(make_table(time_s=paused, command_s=paused), "gaps")
+        assert found.severity is Severity.WARN
+        assert f"2 parts; the pause between them is not fitted ({pause_s:.0f}" in found.message
+    torn = time_s + 0.1 * (np.arange(time_s.size) // 3)
+    assert verdict(make_table(time_s=torn, command_s=torn), "gaps").severity is Severity.FAIL
 
 
 @pytest.mark.parametrize(
