@@ -83,7 +83,7 @@ def test_equal_stamps(make_table: MakeTable, step: int, severity: Severity) -> N
 
 
 def test_gaps_are_counted(make_table: MakeTable) -> None:
-    """A pause, however long, is between two parts; where each third sample is alone, nothing can be fitted."""
+    """A pause, however long, is between two parts; a third sample alone holds nothing that can be fitted."""
     time_s = make_table().time_s
     for pause_s in (1.0, 5.0):
         paused = np.where(np.arange(time_s.size) < 700, time_s, time_s + pause_s)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 import deal_hw
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.pipeline.methods import with_rates
+from deal_hw.calibration import CalibrationResult
 from deal_hw.errors import (
     ConfigurationError,
     DatasetError,
@@ -26,6 +28,7 @@ from deal_hw.sim.mjcf.describe import Sampling
 from deal_hw.testing.plain_robots import make_robot, write
 from deal_hw.types import FloatArray
 from deal_hw.workflows.calibration.intake import calibration_input
+from deal_hw.workflows.calibration.late_commands import late_commands
 from deal_hw.workflows.calibration.recordings import one_rate
 from deal_hw.workflows.calibration.settings import FilesSettings
 from deal_hw.workflows.calibration.space import searched_space
@@ -418,6 +421,14 @@ def test_what_of_short_recordings_is_held_out(
     assert (len(work.episodes), len(work.holdout)) == (fitted, held)
     assert any("held out as a whole" in line for line in said) == (len(seconds) == 8)
     assert any("no held-out error is known" in line for line in said) == (not held)
+
+
+def test_rows_of_several_rates_are_not_moved(owners: Path) -> None:
+    """Commands one row late are one shift at one rate only: at two nothing is tried or named."""
+    work = calibration_input(settings_of(owners, swing(100.0, 3.0, 8), swing(50.0, 3.0, 9)))
+    problem = Problem(work.robot, work.space, work.episodes, threads=1)
+    result = cast(CalibrationResult, SimpleNamespace(latency_s=0.0, chi2=50.0))
+    assert late_commands(problem, result) == () and not problem.steps
 
 
 def test_a_policy_in_the_loop_needs_one_rate() -> None:
