@@ -90,12 +90,11 @@ def diagnose(
     found, rows = [one for one in wider if one.share >= DECISIVE], list[Candidate]()
     unsure = np.zeros(0)
     if not found:
-        found = wider
+        named = {one.code for one in wider}
+        effects = [e for e in name_causes(known(), refined.chi2, len(tried)) if e.code not in named]
+        effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
+        found = sorted((*effects, *wider), key=lambda f: -f.deviance)
         if refined.chi2 <= NEAR_CHI2:
-            named = {one.code for one in wider}
-            effects = [e for e in name_causes(known(), refined.chi2, len(tried)) if e.code not in named]
-            effects = [e for e in effects if e.code != "mass" or weighs(problem, refined, e, tried, allows)]
-            found = sorted((*effects, *wider), key=lambda f: -f.deviance)
             again = {one.hypothesis.name for one in tried}
             rows += [row for row in effect_candidates(known(), effects) if row.explanation not in again]
             unsure = unnamed_shift(known(), {one.code for one in found})
@@ -125,15 +124,17 @@ def name_causes(known: Evidence, chi2: float = 1.0, others: int = 0) -> list[Dia
 
     Args:
         known: The evidence.
-        chi2: The fit's; above :data:`~deal_hw.calib.hypotheses.thresholds.NEAR_CHI2` none is named.
+        chi2: The fit's; above :data:`~deal_hw.calib.hypotheses.thresholds.NEAR_CHI2` only zeros are named, if
+            they leave no more.
         others: How many hypotheses were asked in other ways.
     """
-    if chi2 > NEAR_CHI2:
-        return []
     found: list[Diagnosis] = []
     taken: list[Signature] = []
-    groups = groups_of(known.found)
+    groups, near = groups_of(known.found), chi2 <= NEAR_CHI2
     asked = others + len(groups)
+    if not near:
+        # The effect of a zero is known exactly: what it leaves is what a fit that has it leaves.
+        groups = [group for group in groups if group[0].cause == "zero"]
     while groups and len(found) < MOST_CAUSES:
         groups = [some for group in groups if (some := _possible(known, taken, group))]
         gains = [known.gain(taken, group) for group in groups]
@@ -149,6 +150,8 @@ def name_causes(known: Evidence, chi2: float = 1.0, others: int = 0) -> list[Dia
         if group[0].cause == "zero":
             groups = [g for g in groups if g[0].cause != "load"]
     left = chi2 * float(np.prod([1 - one.share for one in found]))
+    if not near:
+        return found if left <= NEAR_CHI2 else []
     varying, bursts = _varying_delay(known, taken), _bursts(known, known.residual(taken))
     if varying is not None:
         found.append(varying)
