@@ -20,13 +20,13 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import ordinary_robots
 from measuring import Row, Rows, add_seeds, markdown, parser, read_rows
 
-from deal_hw.bench.rows import noted_in
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.fit.intervals import MISMATCH_CHI2
 from deal_hw.calib.fit.refinement import from_start, local_fit
@@ -138,13 +138,12 @@ def main(arguments: list[str] | None = None) -> int:
     rows = Rows(__file__, options.out, names=("kind", "seed", "errors"))
     for kind in options.kinds.split(","):
         for seed in options.seeds:
-            if rows.done(kind, seed, options.errors):
-                continue
-            row: Row = {"kind": kind, "seed": seed, "errors": options.errors, "error": ""}
-            with noted_in(row):
-                row |= measure(kind, seed, options.errors)
-            found = ", ".join(f"{k} {v:.3g}" for k, v in row.items() if isinstance(v, float))
-            rows.add(row, f"{kind} {seed}: {row['error'] or found}")
+            rows.measured(
+                {"kind": kind, "seed": seed, "errors": options.errors},
+                f"{kind} {seed}",
+                partial(measure, kind, seed, options.errors),
+                lambda row: ", ".join(f"{k} {v:.3g}" for k, v in row.items() if isinstance(v, float)),
+            )
     print(table(rows.rows))
     return int(any(row["error"] for row in rows.rows))
 

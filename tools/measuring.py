@@ -12,14 +12,14 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deal_hw.bench.rows import describe_call, load_rows, write_rows
+from deal_hw.bench.rows import describe_call, load_rows, noted_in, write_rows
 from deal_hw.types import FloatArray
 
 Row = dict[str, Any]
@@ -77,6 +77,22 @@ class Rows:
         if printed != "":
             print(printed or json.dumps(row), file=sys.stderr if table else None, flush=True)
         self._write()
+
+    def measured(self, key: Row, name: str, measure: Callable[[], Row], words: Callable[[Row], str]) -> None:
+        """Measure a row that is not there yet, keep it, and print it; one that fails has its error.
+
+        Args:
+            key: Its values of the names, in their order.
+            name: What is measured, for the line that is printed.
+            measure: Returns its other fields.
+            words: Returns what is printed of a row without an error.
+        """
+        if self.done(*key.values()):
+            return
+        row: Row = {**key, "error": ""}
+        with noted_in(row):
+            row |= measure()
+        self.add(row, f"{name}: {row['error'] or words(row)}")
 
     def keep(self, rows: Sequence[Row]) -> None:
         """Keep rows that were measured together, and print nothing."""

@@ -27,6 +27,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,6 @@ import numpy as np
 import yaml
 from measuring import Row, Rows, add_seeds, markdown, parser, read_rows
 
-from deal_hw.bench.rows import noted_in
 from deal_hw.calib.report.verdict import trust
 from deal_hw.calibration import CalibrationResult
 from deal_hw.types import FloatArray
@@ -446,13 +446,13 @@ def main(arguments: list[str] | None = None) -> int:
     rows = Rows(__file__, options.out, names=("kind", "seed", "weighed"))
     for kind in options.kinds.split(","):
         for seed in options.seeds:
-            if rows.done(kind, seed, options.weighed):
-                continue
-            row: Row = {"kind": kind, "seed": seed, "weighed": options.weighed, "error": ""}
-            with noted_in(row):
-                row |= measure(kind, seed, weighed=options.weighed)
-            found = row["error"] or f"{row['colour']}, chi2 {row['chi2']:.3g}, {row['inside']}/{row['shown']}"
-            rows.add(row, f"{kind} {seed}: {found}")
+            key = {"kind": kind, "seed": seed, "weighed": options.weighed}
+            rows.measured(
+                key,
+                f"{kind} {seed}",
+                partial(measure, kind, seed, weighed=options.weighed),
+                lambda row: f"{row['colour']}, chi2 {row['chi2']:.3g}, {row['inside']}/{row['shown']}",
+            )
     print(table(rows.rows))
     return int(any(row["error"] for row in rows.rows))
 

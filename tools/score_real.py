@@ -46,7 +46,6 @@ import one_page
 from measuring import Row, Rows, markdown, parser, read_rows
 
 from deal_hw.bench.first_answer import SETTINGS, go2_inputs, so101_inputs
-from deal_hw.bench.rows import noted_in
 from deal_hw.calib.baselines.sysid import with_delay
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.intervals import names_at_bound
@@ -282,12 +281,12 @@ def main(arguments: list[str] | None = None) -> int:
     rows = Rows(__file__, options.out, names=("robot", "method", "seed"))
     for name in robots:
         for method in methods:
-            if rows.done(name, method, options.seed):
-                continue
-            row: Row = {"robot": name, "method": method, "seed": options.seed, "error": ""}
-            with noted_in(row):
-                row |= score(ROBOTS[name], options.folder, method, options.seed)
-            rows.add(row, f"{name}, {method}: {row['error'] or format(row['rmse'], '.5f')}")
+            rows.measured(
+                {"robot": name, "method": method, "seed": options.seed},
+                f"{name}, {method}",
+                partial(score, ROBOTS[name], options.folder, method, options.seed),
+                lambda row: format(row["rmse"], ".5f"),
+            )
     print(table(rows.rows))
     return int(any(row["error"] for row in rows.rows))
 

@@ -289,7 +289,7 @@ def _slope(x: FloatArray, y: FloatArray, sigma: FloatArray) -> tuple[float, floa
     return float(np.sum(w * (x - mean_x) * (y - mean_y)) / spread), 1.0 / math.sqrt(spread)
 
 
-def alike(values: Sequence[float]) -> list[IntArray]:
+def rows_by_value(values: Sequence[float]) -> list[IntArray]:
     """Return the rows of each distinct value, such as the episodes of each sampling period."""
     every = np.array(values)
     return [np.flatnonzero(every == value) for value in dict.fromkeys(every.tolist())]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from deal_hw.calib.data.problem import Problem
+from deal_hw.calib.data.problem import SHORTEST_WINDOW, Problem
 from deal_hw.calib.data.window_data import WindowData
 from deal_hw.errors import InsufficientDataError
 
@@ -48,9 +48,9 @@ def measurements(windows: Sequence[WindowData]) -> int:
 def samples_in(problem: Problem, seconds: float) -> int:
     """Return the number of the slowest recording's samples in a time.
 
-    It is at least 1 from known start states, 4 from fitted ones.
+    It is at least 1 from known start states, ``SHORTEST_WINDOW`` from fitted ones.
     """
-    return max(round(seconds / problem.period_s), 1 if problem.noise_free else 4)
+    return max(round(seconds / problem.period_s), 1 if problem.noise_free else SHORTEST_WINDOW)
 
 
 def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
@@ -59,11 +59,11 @@ def longest_windows(problem: Problem, seconds: float) -> list[WindowData]:
     Raises:
         InsufficientDataError: Even windows of four samples do not fit.
     """
-    length = max(round(seconds / problem.period_s), 4)
+    length = max(round(seconds / problem.period_s), SHORTEST_WINDOW)
     while True:
         try:
             return problem.windows(length)
         except InsufficientDataError:
-            if length <= 4:
+            if length <= SHORTEST_WINDOW:
                 raise
-            length = max(int(0.8 * length), 4)
+            length = max(int(0.8 * length), SHORTEST_WINDOW)

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from deal_hw.calib.data.noise import alike, autocorrelations
+from deal_hw.calib.data.noise import autocorrelations, rows_by_value
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.fit.cluster_robust import Clustered, clustered
 from deal_hw.calib.fit.null_space import expected_directions, null_directions, null_space
@@ -222,7 +222,7 @@ def correlation_time(
     worst = 1.0
     channels = [
         channel
-        for rows in alike(periods_s or [0.0] * len(residuals))
+        for rows in rows_by_value(periods_s or [0.0] * len(residuals))
         for channel in zip(*(np.moveaxis(residuals[e], 2, 0) for e in rows), strict=True)
     ]
     below = 0.0 if chance is None else float(scipy.stats.norm.ppf(1 - chance / len(channels)))

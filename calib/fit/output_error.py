@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from deal_hw.calib.data.noise import alike
+from deal_hw.calib.data.noise import rows_by_value
 from deal_hw.calib.data.parts import longest_windows
 from deal_hw.calib.data.problem import Member, Problem
 from deal_hw.calib.data.window_data import WindowData
@@ -237,7 +237,7 @@ def _weighed(
     scale = channel_scale(errors, seen, recipe.robust)
     correlations = np.ones(len(errors))
     periods_s = [problem.episodes[d.episode].period_s for d in plain.data]
-    for rows in alike(periods_s) if correlated else ():
+    for rows in rows_by_value(periods_s) if correlated else ():
         longest = round(recipe.longest_lag_s / periods_s[rows[0]])
         correlations[rows] = correlated_samples([errors[e] / scale for e in rows], longest)
     data = []

@@ -31,7 +31,7 @@ import numpy as np
 import scipy
 from scipy.optimize import lsq_linear
 
-from deal_hw.calib.data.noise import MAD_TO_STD, Mask, alike, autocorrelations
+from deal_hw.calib.data.noise import MAD_TO_STD, Mask, autocorrelations, rows_by_value
 from deal_hw.calib.data.parts import taken
 from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.residual import Normal, Point, Shooting, value_bounds
@@ -427,7 +427,7 @@ def independent_samples(
         periods_s: Sampling period of each episode [s].
     """
     found = 0.0
-    for rows in alike(periods_s):
+    for rows in rows_by_value(periods_s):
         of_rate = [residuals[e] for e in rows]
         longest = max(r.shape[1] for r in of_rate)
         found += sum(counts[e] for e in rows) / correlated_samples(of_rate, longest)

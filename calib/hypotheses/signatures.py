@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from deal_hw.calib.data.noise import alike
+from deal_hw.calib.data.noise import rows_by_value
 from deal_hw.calib.data.problem import Problem
 from deal_hw.calib.data.window_data import WindowData
 from deal_hw.calib.fit.refinement import Refined
@@ -191,7 +191,7 @@ def answers(problem: Problem, fit: Refined) -> list[SignatureResponse]:
         changes.append(np.diff(path[0][edges], axis=1))
     means: dict[int, FloatArray] = {}
     # Recordings of another rate, and short ones, have windows of another length.
-    for rows in alike([data.windows.length for data in fit.shooting.data]):
+    for rows in rows_by_value([data.windows.length for data in fit.shooting.data]):
         every = np.concatenate([responses[e] for e in rows], axis=1)
         means |= dict.fromkeys(rows.tolist(), np.nan_to_num(np.mean(every, axis=1)))
     return [

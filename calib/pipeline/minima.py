@@ -53,6 +53,11 @@ class RestartSettings:
         """Return the number of refinements from drawn points."""
         return self.drawn if problem.robot.base is None else CONTACT_DRAWN
 
+    def agree(self, a: Refined, b: Refined) -> bool:
+        """Return whether two fits leave the same residual, and that is enough."""
+        low, high = sorted([a.chi2, b.chi2])
+        return self.alike_ends and high - low < self.same * low
+
     def much_lower(self, a: Refined, b: Refined) -> bool:
         """Return whether ``a`` explains a good part of what ``b`` leaves beyond noise."""
         return b.chi2 - a.chi2 > self.same * (b.chi2 - 1.0)
@@ -106,7 +111,7 @@ def refined_search(
     if part is not run.problem and settings.draws(run.problem):
         on_part = dataclasses.replace(run, problem=part)
         begun = refined_from(on_part, *start, _shortest(run))
-        if run.local is not None and _alike(run, begun, settings):
+        if run.local is not None and settings.agree(run.local, begun):
             return run.local, True
         # The local fit of the same windows, which had no reason to go on to longer ones.
         if run.local is not None and run.local.normal.count == begun.normal.count:
@@ -119,18 +124,10 @@ def refined_search(
     refined = refined_from(run, *start)
     if refined.chi2 < settings.explained or not settings.draws(run.problem):
         return refined, False
-    if run.local is not None and _alike(run, refined, settings):
+    if run.local is not None and settings.agree(run.local, refined):
         return min(run.local, refined, key=lambda fit: fit.chi2), True
     lower = lower_minimum(run, refined, settings, searched)
     return lower or refined, lower is None or not settings.much_lower(lower, refined)
-
-
-def _alike(run: CalibrationRun, found: Refined, settings: RestartSettings) -> bool:
-    """Return whether a fit and the local one leave the same residual, and that is enough."""
-    if not settings.alike_ends or run.local is None:
-        return False
-    low, high = sorted([found.chi2, run.local.chi2])
-    return high - low < settings.same * low
 
 
 def lower_minimum(

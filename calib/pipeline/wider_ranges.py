@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 
 from deal_hw.calib.data.problem import Member, Problem
-from deal_hw.calib.fit.intervals import latency_end, names_at_bound, pressed_ends, wider_latency
+from deal_hw.calib.fit.intervals import latency_end, pressed_ends, wider_latency
 from deal_hw.calib.fit.output_error import OutputErrorFit, Recipe, fit_output_error
 from deal_hw.calib.fit.refinement import Refined
 from deal_hw.calib.pipeline.calibration_run import CalibrationRun, FitOutcome
@@ -99,11 +99,16 @@ def fit_beyond_ends(problem: Problem, start: Member, recipe: Recipe) -> OutputEr
     """
     fit = fit_output_error(problem, *start, recipe)
     for _ in range(MOST):
-        held = {p.name for p in problem.space if p.prior_std is not None}
-        ends = dict(zip(problem.space.names, np.sign(problem.space.normalize(fit.theta) - 0.5), strict=True))
-        at_end = held.intersection(names_at_bound(problem.space, fit.theta), problem.guessed)
-        wide = wider(problem.space, {name: int(ends[name]) for name in sorted(at_end)})
-        if wide.to_json() == problem.space.to_json():
+        space = problem.space
+        # Whatever the slope: the expected value holds it beyond the end.
+        ends = pressed_ends(space, fit.theta, np.zeros(len(space)))
+        at_end = {
+            p.name: int(end)
+            for p, end in zip(space, ends, strict=True)
+            if end and p.prior_std is not None and p.name in problem.guessed
+        }
+        wide = wider(space, at_end)
+        if not grown_ranges(problem, wide, problem.latency_range_s):
             break
         problem = problem.with_space(wide)
         fit = fit_output_error(problem, *fit.member, recipe)
